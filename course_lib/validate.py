@@ -1,0 +1,29 @@
+"""Argument checks shared by the course's functions: each error names the argument, the rule and the value received."""
+
+from __future__ import annotations
+
+import torch
+
+
+def same_shape(**tensors: torch.Tensor) -> None:
+    """Raise ValueError unless all tensors have one shape.
+
+    >>> same_shape(rewards=torch.zeros(3, 2), values=torch.zeros(3))
+    Traceback (most recent call last):
+    ValueError: rewards, values must have one shape, got rewards (3, 2), values (3,)
+    """
+    if len({tuple(tensor.shape) for tensor in tensors.values()}) > 1:
+        shapes = ", ".join(f"{name} {tuple(tensor.shape)}" for name, tensor in tensors.items())
+        raise ValueError(f"{', '.join(tensors)} must have one shape, got {shapes}")
+
+
+def unit_interval(**scalars: float) -> None:
+    """Raise ValueError unless every scalar lies in [0, 1].
+
+    >>> unit_interval(gamma=1.5)
+    Traceback (most recent call last):
+    ValueError: gamma must lie in [0, 1], got 1.5
+    """
+    for name, value in scalars.items():
+        if not 0 <= value <= 1:
+            raise ValueError(f"{name} must lie in [0, 1], got {value}")
