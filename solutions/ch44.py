@@ -51,11 +51,11 @@ def compute_gae(rewards, values, next_values, terminated, truncated, gamma=0.99,
     validate.same_shape(rewards=rewards, values=values, next_values=next_values, terminated=terminated, truncated=truncated)
     validate.unit_interval(gamma=gamma, gae_lambda=gae_lambda)
     deltas = td_residuals(rewards, values, next_values, terminated, gamma)
-    carry_on = gamma * gae_lambda * ~(terminated | truncated)
+    ended = terminated | truncated
     advantages = torch.zeros_like(deltas)
     following = torch.zeros_like(deltas[0])
     for t in reversed(range(len(deltas))):
-        following = deltas[t] + carry_on[t] * following
+        following = deltas[t] + gamma * gae_lambda * torch.where(ended[t], 0, following)
         advantages[t] = following
     return advantages
 

@@ -1,0 +1,92 @@
+"""Turn an exercise's specification into frozen cases: draw the inputs, run the reference and every misconception on them.
+
+`visible` gives what a learner's notebook gets, `hidden` what the judge uses on top of it. The draws of the two never share a seed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from autograder.spec import Case, Exercise
+from course_lib.cases import FrozenCase, FrozenExercise, save
+from course_lib.diagnosis import differing_facets
+from course_lib.runner import observe
+
+
+class FreezeError(ValueError):
+    """A specification that contradicts itself; the message names exercise and case."""
+
+
+def visible(exercise: Exercise, seed: int = 0) -> FrozenExercise:
+    """The cases that learners see, with one draw each."""
+    cases = [_freeze(exercise, case, seed, 0, True) for case in exercise.cases if case.visible]
+    return _exercise(exercise, cases)
+
+
+def complete(exercise: Exercise, seed: int = 0) -> FrozenExercise:
+    """All cases: the visible ones as learners see them, then `draws` hidden draws of every case."""
+    hidden = [_freeze(exercise, case, seed, draw, False) for case in exercise.cases for draw in range(1, case.draws + 1)]
+    return _exercise(exercise, visible(exercise, seed).cases + hidden)
+
+
+def write(exercises: Iterable[Exercise], directory: Path) -> None:
+    """Write `directory/NAME.npz` with the visible cases of each exercise."""
+    directory.mkdir(parents=True, exist_ok=True)
+    for exercise in exercises:
+        save(directory / f"{exercise.name}.npz", visible(exercise))
+
+
+def _exercise(exercise: Exercise, cases: list[FrozenCase]) -> FrozenExercise:
+    return FrozenExercise(
+        name=exercise.name,
+        criteria=dict(exercise.criteria),
+        messages={mistake.name: mistake.message for mistake in exercise.misconceptions},
+        cases=cases,
+        axes=list(exercise.axes),
+        last_step_first=exercise.last_step_first,
+    )
+
+
+def _freeze(exercise: Exercise, case: Case, seed: int, draw: int, is_visible: bool) -> FrozenCase:
+    inputs = {name: _plain(value, case.dtype) for name, value in case.inputs(_generator(exercise, case, seed, draw)).items()}
+
+    def seen(function: Callable) -> Any:
+        return observe(function, inputs, case.differentiate)
+
+    frozen = FrozenCase(
+        name=case.name,
+        arguments=inputs,
+        expected=[seen(right) for right in (exercise.reference, *exercise.also_right)],
+        misconceptions={mistake.name: seen(mistake.function) for mistake in exercise.misconceptions},
+        differentiate=list(case.differentiate),
+        raises=list(case.raises),
+        facet=case.facet,
+        visible=is_visible,
+    )
+    _prove(exercise, case, frozen, seen)
+    return frozen
+
+
+def _prove(exercise: Exercise, case: Case, frozen: FrozenCase, seen: Callable) -> None:
+    for right in frozen.expected:
+        refused = right.error == "ValueError" and any(name in right.message for name in case.raises)
+        if refused != bool(case.raises) or (right.error and not case.raises):
+            raise FreezeError(f"{exercise.name}, case {case.name!r}: the reference does not do what the case says: {right}")
+    if case.closed_form and "values" in differing_facets(seen(case.closed_form), frozen.expected[0], frozen):
+        raise FreezeError(f"{exercise.name}, case {case.name!r}: the reference and the closed form differ")
+
+
+def _generator(exercise: Exercise, case: Case, seed: int, draw: int) -> torch.Generator:
+    digest = hashlib.sha256(f"{exercise.name}/{case.name}/{seed}/{draw}".encode()).digest()
+    return torch.Generator().manual_seed(int.from_bytes(digest[:7], "big"))
+
+
+def _plain(value: Any, dtype: torch.dtype) -> Any:
+    if isinstance(value, torch.Tensor):
+        return (value.to(dtype) if value.is_floating_point() else value).numpy()
+    return value

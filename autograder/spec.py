@@ -1,0 +1,76 @@
+"""What a chapter's checks are made of: exercises, cases, misconceptions and correct variants, as data.
+
+A chapter's module `autograder/checks/chNN.py` has one tuple, `EXERCISES`. The same cases run in the learner's notebook (those that
+are visible, frozen to arrays), in the judge, in the tests, and in the book's kill matrix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+Inputs = Callable[[torch.Generator], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One kind of call.
+
+    `inputs` draws the arguments (float64 tensors, scalars) from a seeded generator. `closed_form` takes the same arguments and gives the
+    answer by another route; the reference is held against it whenever the case is frozen. `differentiate` names the arguments that
+    require gradient: what the reference passes on to each is the contract. `raises` names the arguments of which a ValueError must
+    mention one. A visible case is also shown to learners, with one draw; the judge takes `draws` of every case.
+    """
+
+    name: str
+    inputs: Inputs
+    closed_form: Callable | None = None
+    differentiate: Sequence[str] = ()
+    raises: Sequence[str] = ()
+    dtype: torch.dtype = torch.float64
+    visible: bool = False
+    draws: int = 2
+
+    @property
+    def facet(self) -> str:
+        """What an unexpected exception in this case costs."""
+        if self.raises:
+            return "errors"
+        if self.differentiate:
+            return "gradient"
+        return "values" if self.dtype == torch.float64 else "dtype"
+
+
+@dataclass(frozen=True)
+class Misconception:
+    """A named wrong answer: a small implementation, and what a learner who wrote it should look at."""
+
+    name: str
+    function: Callable
+    message: str
+
+
+@dataclass(frozen=True)
+class Exercise:
+    """An exercise of a chapter: the reference, its cases, its points by facet (course_lib.cases.FACETS).
+
+    `also_right` has references that differ from the first where the contract leaves a choice (biased or unbiased deviation);
+    `variants` are correct solutions in other styles that the tests and the kill matrix must see accepted.
+    """
+
+    name: str
+    reference: Callable
+    criteria: Mapping[str, float]
+    cases: Sequence[Case]
+    misconceptions: Sequence[Misconception]
+    variants: Mapping[str, Callable]
+    also_right: Sequence[Callable] = ()
+    axes: Sequence[str] = field(default=())
+    last_step_first: bool = False
+
+    @property
+    def points(self) -> float:
+        return round(sum(self.criteria.values()), 6)

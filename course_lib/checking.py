@@ -1,0 +1,110 @@
+"""The learner's check: `check(compute_gae)` runs the visible cases in the notebook and says what is wrong.
+
+The cases lie beside this file as arrays (`frozen/NAME.npz`): inputs, right outputs and gradients, and what each named misconception
+would give. There is no code of any solution or check here.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import html
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from course_lib.cases import FACET_TEXT, FrozenExercise, load
+from course_lib.diagnosis import Finding, diagnose
+from course_lib.runner import observe
+
+FROZEN = Path(__file__).parent / "frozen"
+
+HEADLINES = {
+    "correct": "Passed",
+    "partial": "Nearly there",
+    "wrong": "Not yet",
+    "error": "It stops with an error",
+    "not_implemented": "Not implemented yet",
+}
+
+
+class CheckResult:
+    """What `check` found; shows itself as a small box in Jupyter and as plain text elsewhere."""
+
+    def __init__(self, finding: Finding, exercise: FrozenExercise, seconds: float) -> None:
+        self.finding = finding
+        self.passed = finding.state == "correct"
+        self._facets = [facet for facet in FACET_TEXT if exercise.criteria.get(facet)]
+        self._cases = len(exercise.cases)
+        self._seconds = seconds
+
+    def _headline(self) -> str:
+        return f"{HEADLINES[self.finding.state]}: {self.finding.exercise}"
+
+    def _lines(self) -> list[str]:
+        if self.passed:
+            return [f"{self._cases} visible cases, {self._seconds * 1000:.0f} ms. The grader draws more like them."]
+        return self.finding.message.splitlines() if self.finding.state != "not_implemented" else []
+
+    def _ticks(self) -> list[tuple[str, str]]:
+        """The facets with a tick or a cross; once the values are wrong the others can't be told apart from it."""
+        if self.finding.state in ("not_implemented", "error") or "values" in self.finding.failed:
+            return []
+        return [("✗" if facet in self.finding.failed else "✓", FACET_TEXT[facet]) for facet in self._facets]
+
+    def __repr__(self) -> str:
+        mark = "✓" if self.passed else "✗"
+        return "\n".join(
+            [f"{mark} {self._headline()}", *(f"  {line}" for line in self._lines()), *(f"  {m} {text}" for m, text in self._ticks())]
+        )
+
+    def _repr_html_(self) -> str:
+        colour = {"correct": "#2e8540", "not_implemented": "#7a7a7a", "partial": "#b36b00"}.get(self.finding.state, "#c0392b")
+        mark = "✓" if self.passed else ("…" if self.finding.state == "not_implemented" else "✗")
+        lines = "".join(f'<div style="margin-top:.3em">{html.escape(line)}</div>' for line in self._lines())
+        ticks = "".join(f'<li style="list-style:none">{m} {html.escape(text)}</li>' for m, text in self._ticks())
+        ticks = f'<ul style="margin:.4em 0 0;padding:0">{ticks}</ul>' if ticks else ""
+        return (
+            f'<div class="course-check" role="status" style="border-left:4px solid {colour};padding:.5em .9em;margin:.3em 0">'
+            f"<strong>{mark} {html.escape(self._headline())}</strong>{lines}{ticks}</div>"
+        )
+
+
+def check(function: Callable) -> CheckResult:
+    """Check your function on the visible cases and show what was found.
+
+    Args:
+      function: one of the chapter's exercises, as you defined it: `check(compute_gae)`.
+
+    Returns: a CheckResult; its `passed` is True if every visible case passed.
+    Raises: TypeError or LookupError with what to do, if there is nothing of that name to check.
+    """
+    name = getattr(function, "__name__", None)
+    if not callable(function) or not isinstance(name, str):
+        raise TypeError(f"check takes a function, as in check(compute_gae); it got {function!r:.80}")
+    exercise = visible_cases(name)
+    start = time.perf_counter()
+    finding = diagnose(exercise, [observe(function, case.arguments, case.differentiate) for case in exercise.cases])
+    result = CheckResult(finding, exercise, time.perf_counter() - start)
+    if os.environ.get("NBGRADER_EXECUTION") == "validate" and not result.passed:
+        raise AssertionError(repr(result))  # nbgrader's Validate button goes by exceptions alone
+    return result
+
+
+@functools.cache
+def visible_cases(name: str) -> FrozenExercise:
+    """The frozen visible cases of the exercise `name`. Raises LookupError, with what to do, if there are none."""
+    known = exercise_names()
+    if name in known:
+        return load(FROZEN / f"{name}.npz")
+    if not known:
+        raise LookupError("This copy of course_lib has no frozen checks: install the course_lib folder of your bundle (in the repository: make book).")
+    close = difflib.get_close_matches(name, known, 1)
+    hint = f"Did you mean {close[0]}?" if close else f"Exercises: {', '.join(known)}."
+    raise LookupError(f"There is no exercise called {name}. {hint}")
+
+
+def exercise_names() -> list[str]:
+    """The names of all exercises that can be checked here."""
+    return sorted(path.stem for path in FROZEN.glob("*.npz"))
