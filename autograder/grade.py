@@ -1,0 +1,159 @@
+"""Grade a folder of submissions: judge them side by side, and let one writer put down verdicts, gradebook and reports.
+
+Running again over the same or other submissions converges: every file is replaced atomically, scores given by hand stay, students who
+are not in the folder keep what they have, and what a killed run left undone is done by the next.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from nbformat import NotebookNode
+
+from autograder import assemble, chapter, exports, gradebook, intake, judge, sandbox, verdicts
+from autograder.verdicts import Verdict
+
+ATTEMPTS = 2  # a submission whose sandbox failed on our side is tried once more
+
+
+class GradingError(ValueError):
+    """Nothing can be graded; the message says what to do."""
+
+
+def grade(
+    submitted: Path,
+    out: Path,
+    jobs: int = 1,
+    scheduler: str | None = None,
+    timeout: float = 60.0,
+    db_url: str | None = None,
+    trusted: bool = False,
+    progress: Callable[[int, int, str], None] = lambda done, total, name: None,
+) -> list[Verdict]:
+    """Grade `submitted/{student}/{assignment}/{assignment}.ipynb` into `out`.
+
+    Args:
+      submitted: the folder of submissions.
+      out: where everything is written; also nbgrader's course folder.
+      jobs: submissions judged at a time on this machine.
+      scheduler: address of a Dask scheduler whose workers share this file system; replaces `jobs`.
+      timeout: seconds for each exercise, and for loading a notebook.
+      db_url: nbgrader's gradebook, `sqlite:///out/gradebook.db` by default.
+      trusted: no sandbox. For one's own code only.
+      progress: called with (done, total, "student/assignment") after each submission.
+
+    Returns: the verdicts of this run, sorted by student and assignment.
+    Raises: GradingError if there is nothing to grade; sandbox.SandboxUnavailable if no sandbox can be had.
+    """
+    tasks = _tasks(submitted)
+    if not trusted:
+        sandbox.require()
+    out.mkdir(parents=True, exist_ok=True)
+    known = {page.assignment: page for page in chapter.all_chapters()}
+    releases = {name: assemble.student_view(page) for name, page in known.items()}
+    with _one_run_at_a_time(out):
+        gradebook.write_course(out, releases, db_url)
+        with gradebook.GradebookWriter(db_url or f"sqlite:///{(out / 'gradebook.db').resolve()}") as book:
+            for name in {assignment for _, assignment, _ in tasks} & known.keys():
+                book.register(name, releases[name])
+            results = []
+            judged = _on_dask(tasks, scheduler, timeout) if scheduler else _here(tasks, jobs, timeout, trusted)
+            for verdict, notebook in judged:
+                results.append(_write(verdict, notebook, out, book, releases))
+                progress(len(results), len(tasks), f"{verdict.student}/{verdict.assignment}")
+            exports.write_all(out, book)
+    return sorted(results, key=lambda verdict: (verdict.student, verdict.assignment))
+
+
+def judge_folder(student: str, assignment: str, folder: Path, timeout: float, trusted: bool = False) -> tuple[Verdict, NotebookNode | None]:
+    """Judge one submission, wherever this runs; our own failures become infra_error after a second attempt."""
+    submission = intake.read(student, assignment, folder)
+    if assignment not in {page.assignment for page in chapter.all_chapters()}:
+        return judge.unknown_assignment(submission), None
+    release = judge.released(assignment)
+    failure: Exception | None = None
+    for _ in range(ATTEMPTS):
+        try:
+            return judge.judge(submission, release, timeout, trusted), submission.notebook
+        except (sandbox.SandboxUnavailable, judge.WorkerFailed, OSError) as error:
+            failure = error
+    return _infra_error(submission, release, failure), submission.notebook
+
+
+def _infra_error(submission: intake.Submission, release: judge.Released, failure: Exception | None) -> Verdict:
+    total = round(sum(exercise.points for exercise in release.exercises), 4)
+    manual = sum(points for _, points in release.open_questions)
+    flags = (*submission.flags, f"grader_failed: {type(failure).__name__}: {failure}")
+    return Verdict.of(
+        Verdict(
+            submission.student, submission.assignment, "infra_error", 0.0, total, None, manual, flags=flags, environment=release.environment
+        )
+    )
+
+
+def _tasks(submitted: Path) -> list[tuple[str, str, Path]]:
+    if not submitted.is_dir():
+        raise GradingError(f"{submitted}: no such folder. Give the folder that holds STUDENT/ASSIGNMENT/ASSIGNMENT.ipynb.")
+    tasks = intake.discover(submitted)
+    if not tasks:
+        raise GradingError(f"{submitted}: no submissions in it. Expected STUDENT/ASSIGNMENT/ASSIGNMENT.ipynb, nbgrader's layout.")
+    return tasks
+
+
+def _here(tasks: list[tuple[str, str, Path]], jobs: int, timeout: float, trusted: bool) -> Iterator[tuple[Verdict, NotebookNode | None]]:
+    # threads, for a verdict is made mostly by waiting; bubblewrap dies with the thread that started it, and these live to the end
+    with ThreadPoolExecutor(jobs) as pool:
+        futures = [pool.submit(judge_folder, *task, timeout, trusted) for task in tasks]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _on_dask(tasks: list[tuple[str, str, Path]], scheduler: str, timeout: float) -> Iterator[tuple[Verdict, NotebookNode | None]]:
+    from distributed import Client, as_completed  # a second of imports that a local run need not pay
+
+    with Client(scheduler, timeout="30s") as client:
+        futures = {
+            client.submit(judge_folder, student, assignment, folder.resolve(), timeout, pure=False, retries=1): (student, assignment, folder)
+            for student, assignment, folder in tasks
+        }
+        for future in as_completed(futures):
+            student, assignment, folder = futures[future]
+            if future.status == "finished":
+                yield future.result()
+            else:  # the worker died, twice
+                submission = intake.read(student, assignment, folder)
+                yield _infra_error(submission, judge.released(assignment), future.exception()), None
+
+
+def _write(
+    verdict: Verdict, notebook: NotebookNode | None, out: Path, book: gradebook.GradebookWriter, releases: dict[str, NotebookNode]
+) -> Verdict:
+    """Gradebook first, then the notebook that formgrader shows, then the verdict, which says that the rest is done."""
+    if verdict.assignment in releases:
+        previous = gradebook.read_autograded(out, verdict.student, verdict.assignment)
+        book.record(verdict, notebook, previous)
+        gradebook.write_autograded(out, releases[verdict.assignment], notebook, verdict)
+        given, maximum = book.manual_scores(verdict.student, verdict.assignment)
+        verdict = replace(verdict, manual_score=given, manual_max_score=maximum)
+    verdicts.write(out / "verdicts", verdict)
+    return verdict
+
+
+@contextmanager
+def _one_run_at_a_time(out: Path) -> Iterator[None]:
+    """Wait for another run on the same folder; the kernel gives the lock back when a run is killed."""
+    descriptor = os.open(out / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,309 @@
+"""The trusted side: run a submission in a sandbox, send inputs, receive arrays, compare them here, and write the verdict.
+
+What the learner's process says is data: it is parsed strictly, compared with expectations that never leave this process, and whatever
+it does wrong (hangs, exits, talks nonsense) costs the exercise at hand and nothing else.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import re
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import course_lib
+from autograder import assemble, chapter, checks, freeze, intake
+from autograder.paths import ROOT
+from autograder.sandbox import Sandbox, SandboxDied, SandboxError, SandboxGarbage, SandboxTimeout, SandboxUnavailable
+from autograder.verdicts import Item, Verdict, clean_text
+from course_lib.cases import FrozenExercise, Observation, decode, encode
+from course_lib.diagnosis import Finding, diagnose
+from course_lib.notebook import is_check, is_live
+
+WORKER = Path(__file__).with_name("worker.py")
+COURSE_LIB = Path(course_lib.__file__).parent
+START_SECONDS = 120.0  # importing torch on a busy machine; nothing of the learner's has run by then
+GRACE_SECONDS = 5.0  # how much longer the judge waits than the worker's own timer
+SLACK_SECONDS = 10.0  # for starting sandboxes, on top of (exercises + 1) * timeout
+
+
+class WorkerFailed(RuntimeError):
+    """Our own process inside the sandbox did not come up: no fault of the learner's."""
+
+
+@dataclass(frozen=True)
+class Released:
+    """What the judge knows of an assignment, all of it from the release and nothing from a submission."""
+
+    assignment: str
+    exercises: tuple[FrozenExercise, ...]
+    open_questions: tuple[tuple[str, float], ...]
+    grade_ids: frozenset[str]
+    live_sources: frozenset[str]
+    environment: str
+
+
+@functools.cache
+def released(assignment: str) -> Released:
+    """The release of an assignment. Raises chapter.ChapterError or KeyError-like errors if there is no such chapter."""
+    page = chapter.load(assignment)
+    outline = assemble.assignment(page)
+    exercises = tuple(freeze.complete(exercise) for exercise in checks.exercises(assignment))
+    names = {exercise.name for exercise in exercises}
+    tests = {f"test_{name}" for name in names}
+    questions = {name for name, _ in outline.open_questions}
+    live = frozenset(_squeezed(cell.source) for cell in page.cells if cell.kind == "code" and "live" in cell.tags)
+    return Released(assignment, exercises, tuple(outline.open_questions), frozenset(names | tests | questions), live, environment())
+
+
+@functools.cache
+def environment() -> str:
+    """sha256 of the pins, the checks, the references and the code that judges: what a score depends on beside the submission."""
+    folders = ("autograder", "solutions", "course_lib")
+    files = [ROOT / "requirements.txt", ROOT / "constraints.txt"] + [p for folder in folders for p in (ROOT / folder).rglob("*.py")]
+    digest = hashlib.sha256()
+    for path in sorted(files):
+        digest.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+def judge(submission: intake.Submission, release: Released, timeout: float = 60.0, trusted: bool = False) -> Verdict:
+    """Grade one submission.
+
+    Args:
+      submission: as read by intake; a submission without a notebook is a student_error.
+      release: the assignment.
+      timeout: seconds for each exercise, and for loading the notebook.
+      trusted: run without a sandbox; for one's own code only.
+
+    Returns: a final verdict (graded, needs_review or student_error).
+    Raises: SandboxUnavailable or WorkerFailed, if our own machinery fails.
+    """
+    start = time.monotonic()
+    flags = list(submission.flags)
+    if submission.notebook is None:
+        findings = [
+            Finding(exercise.name, "error", 0.0, exercise.points, message=submission.problem) for exercise in release.exercises
+        ]
+        status = "student_error"
+    else:
+        tampered = tampering(submission.notebook, release)
+        flags += tampered
+        run = _Run(submission, release, timeout, trusted)
+        findings = run.findings()
+        flags += run.flags
+        status = "needs_review" if tampered else "graded"
+    items = [
+        Item(f.exercise, f.score, f.max_score, f.state, tuple(f.misconceptions), clean_text(f.message)) for f in findings
+    ]
+    items += [Item(name, 0.0, points, "manual") for name, points in release.open_questions]
+    return Verdict.of(
+        Verdict(
+            student=submission.student,
+            assignment=submission.assignment,
+            status=status,
+            score=round(sum(f.score for f in findings), 4),
+            max_score=round(sum(f.max_score for f in findings), 4),
+            manual_max_score=sum(points for _, points in release.open_questions),
+            items=tuple(items),
+            flags=tuple(flags),
+            seconds=round(time.monotonic() - start, 3),
+            environment=release.environment,
+        )
+    )
+
+
+def unknown_assignment(submission: intake.Submission) -> Verdict:
+    """The verdict on a folder whose name is no assignment of the course."""
+    flags = ("unknown_assignment", *submission.flags)
+    return Verdict.of(Verdict(submission.student, submission.assignment, "student_error", 0.0, 0.0, flags=flags, environment=environment()))
+
+
+def tampering(notebook: Any, release: Released) -> list[str]:
+    """Released cells that are missing or stand twice; a person must look at such a notebook."""
+    found = intake.grade_ids(notebook)
+    missing = [f"missing_cell: {name}" for name in sorted(release.grade_ids) if not found[name]]
+    twice = [f"duplicate_cell: {name}" for name in sorted(release.grade_ids) if found[name] > 1]
+    return missing + twice
+
+
+def runnable(notebook: Any, release: Released) -> list[tuple[int, str]]:
+    """The (number, source) of the code cells that are the learner's to run: not the checks, and nothing that the release marks live."""
+    cells = []
+    for number, cell in enumerate((cell for cell in notebook.cells if cell.cell_type == "code"), start=1):
+        is_answer = cell.metadata.get("nbgrader", {}).get("solution") is True
+        skipped = is_check(cell) or is_live(cell) or _squeezed(cell.source) in release.live_sources
+        if is_answer or not skipped:
+            cells.append((number, cell.source))
+    return cells
+
+
+def _squeezed(source: str) -> str:
+    return "".join(source.split())
+
+
+@dataclass
+class _Run:
+    """One submission's way through as many sandboxes as it takes: a fresh one whenever the last was lost."""
+
+    submission: intake.Submission
+    release: Released
+    timeout: float
+    trusted: bool
+    flags: list[str] = field(default_factory=list)
+
+    def findings(self) -> list[Finding]:
+        self._cells = runnable(self.submission.notebook, self.release)
+        self._loading_failures: dict[str, str] = {}
+        self._reserved = 0
+        self._deadline = time.monotonic() + (len(self.release.exercises) + 1) * self.timeout + SLACK_SECONDS
+        found: dict[str, Finding] = {}
+        pending = list(self.release.exercises)
+        while pending and time.monotonic() < self._deadline:
+            with Sandbox(WORKER, [COURSE_LIB], self.submission.files, trusted=self.trusted) as sandbox:
+                self._wait_until_ready(sandbox)
+                if not self._load(sandbox, pending):
+                    continue
+                while pending:
+                    exercise = pending.pop(0)
+                    try:
+                        found[exercise.name] = self._ask(sandbox, exercise)
+                    except SandboxTimeout:
+                        found[exercise.name] = self._timed_out(exercise)
+                        break
+                    except (SandboxError, ValueError) as error:
+                        found[exercise.name] = _failed(exercise, "error", f"The call ended the process: {error}.")
+                        break
+        return [found.get(exercise.name) or self._timed_out(exercise) for exercise in self.release.exercises]
+
+    @staticmethod
+    def _wait_until_ready(sandbox: Sandbox) -> None:
+        try:
+            if decode(sandbox.receive(START_SECONDS)) != {"ready": True}:
+                raise WorkerFailed("the worker did not say that it is ready")
+        except (SandboxTimeout, SandboxDied, SandboxGarbage, ValueError) as error:
+            raise WorkerFailed(f"the worker did not start: {error}") from error
+
+    def _load(self, sandbox: Sandbox, pending: list[FrozenExercise]) -> bool:
+        """Run the learner's cells. If one hangs or ends the process, drop it, so that the next attempt goes round it."""
+        running = None
+        until = time.monotonic() + self._loading_time(pending)
+        try:
+            sandbox.send(encode({"cells": self._cells}), self._left(until))
+            while True:
+                told = _mapping(decode(sandbox.receive(self._left(until))))
+                if "loaded" in told:
+                    self._loading_failures = {str(number): str(text) for number, text in _mapping(told["loaded"]).items()}
+                    return True
+                running = int(told["running"])
+        except (SandboxError, ValueError, KeyError, TypeError) as error:
+            self._drop(running, error, pending)
+            return False
+
+    def _loading_time(self, pending: list[FrozenExercise]) -> float:
+        """`timeout`, but a further attempt must leave their own time to the exercises that were complete before the trouble."""
+        return min(self.timeout, self._deadline - time.monotonic() - self.timeout * self._reserved)
+
+    def _drop(self, running: int | None, error: Exception, pending: list[FrozenExercise]) -> None:
+        if not self._cells:
+            raise WorkerFailed(f"the worker failed with nothing to run: {error}") from error
+        numbers = [number for number, _ in self._cells]
+        position = numbers.index(running) if running in numbers else len(numbers) - 1
+        trouble = "did_not_finish" if isinstance(error, SandboxTimeout) else "ended_the_process"
+        self.flags.append(f"cell_{numbers[position]}_{trouble}")
+        later = [exercise for exercise in pending if _last_definition(exercise.name, self._cells) > position]
+        earlier = [exercise for exercise in pending if exercise not in later]
+        pending[:] = earlier + later  # what was complete before the trouble is judged first
+        self._reserved = len(earlier)
+        if self._loading_time(pending) < 1 or not later:
+            del self._cells[position:]
+        else:
+            del self._cells[position]
+
+    def _ask(self, sandbox: Sandbox, exercise: FrozenExercise) -> Finding:
+        seconds = min(self.timeout, max(self._deadline - time.monotonic(), 0.1))
+        cases = [{"arguments": case.arguments, "differentiate": case.differentiate} for case in exercise.cases]
+        sandbox.send(encode({"exercise": exercise.name, "seconds": seconds, "cases": cases}), GRACE_SECONDS)
+        patience = min(seconds + GRACE_SECONDS, max(self._deadline - time.monotonic(), 0.1) + 1)
+        told = _mapping(decode(sandbox.receive(patience)))
+        if "observations" in told:
+            return diagnose(exercise, _observations(told["observations"], exercise))
+        if told.get("missing"):
+            return self._missing(exercise)
+        if told.get("ended") == "timeout":
+            return self._timed_out(exercise)
+        return _failed(exercise, "error", "The call ended its process.")
+
+    def _missing(self, exercise: FrozenExercise) -> Finding:
+        where = _last_definition(exercise.name, self._cells)
+        number = str(self._cells[where][0]) if where >= 0 else ""
+        if number in self._loading_failures:
+            return _failed(exercise, "error", f"Code cell {number}, which defines it, stops: {self._loading_failures[number]}")
+        return _failed(exercise, "not_implemented", f"The notebook defines no function {exercise.name}.")
+
+    def _timed_out(self, exercise: FrozenExercise) -> Finding:
+        return _failed(exercise, "timeout", f"No answer within {self.timeout:g} s.")
+
+    @staticmethod
+    def _left(until: float) -> float:
+        return max(until - time.monotonic(), 0.01)
+
+
+def _failed(exercise: FrozenExercise, state: str, message: str) -> Finding:
+    return Finding(exercise.name, state, 0.0, exercise.points, message=message)
+
+
+def _last_definition(name: str, cells: Sequence[tuple[int, str]]) -> int:
+    """The position of the last cell that defines `name`, as text (a hostile cell is not worth parsing); -1 if none does."""
+    pattern = re.compile(rf"^\s*(?:(?:async\s+)?def\s+{name}\s*\(|class\s+{name}\b|{name}\s*(?::[^=\n]*)?=[^=])", re.MULTILINE)
+    return max((position for position, (_, source) in enumerate(cells) if pattern.search(source)), default=-1)
+
+
+# -------------------------------------------------------------------------------- what comes out of the sandbox, strictly
+
+
+def _mapping(data: Any) -> dict[str, Any]:
+    if not isinstance(data, dict):
+        raise ValueError("the answer is no mapping")
+    return data
+
+
+def _observations(data: Any, exercise: FrozenExercise) -> list[Observation]:
+    if not isinstance(data, list) or len(data) != len(exercise.cases):
+        raise ValueError("the answer has not one observation for each case")
+    return [_observation(entry) for entry in data]
+
+
+def _observation(data: Any) -> Observation:
+    seen = Observation(**{str(name): value for name, value in _mapping(data).items() if name in Observation.__dataclass_fields__})
+    texts = (seen.error, seen.message, seen.kind)
+    lists = (*_list(seen.graph), *_list(seen.mutated))
+    arrays = (*_mapping(seen.outputs).values(), *(g for g in _mapping(seen.gradients).values() if g is not None))
+    if not all(isinstance(text, str) for text in (*texts, *lists)):
+        raise ValueError("the answer has something else where text belongs")
+    if not all(isinstance(array, np.ndarray) and array.dtype.kind in "fiub" for array in arrays):
+        raise ValueError("the answer has something else where numbers belong")
+    if _kind(seen.outputs) != seen.kind and seen.outputs:
+        raise ValueError("the answer contradicts itself")
+    return seen
+
+
+def _list(value: Any) -> list[Any]:
+    if not isinstance(value, list):
+        raise ValueError("the answer has no list where one belongs")
+    return value
+
+
+def _kind(outputs: dict[str, Any]) -> str:
+    """The kind of return value that has these outputs, as course_lib.runner names it."""
+    if list(outputs) == [""]:
+        return "tensor"
+    if all(key == str(position) for position, key in enumerate(outputs)):
+        return f"tuple of {len(outputs)}"
+    return f"dict of {', '.join(sorted(outputs))}"

@@ -1,0 +1,116 @@
+"""Runs inside the sandbox: executes a learner's cells, then calls their functions on the inputs that the judge sends.
+
+Nothing here is trusted once learner code has run, and nothing here is secret: there is no expected value in this process. The judge
+reads answers as plain arrays and compares them in its own process.
+
+The conversation, in frames of course_lib.cases.encode, over the stream socket whose number is sys.argv[1]:
+
+    worker  {"ready": true}
+    judge   {"cells": [[number, source], …]}
+    worker  {"running": number} before each cell, then {"loaded": {number: error text}}
+    judge   {"exercise": name, "seconds": s, "cases": [{"arguments": …, "differentiate": …}, …]}
+    worker  {"observations": […]} | {"missing": true} | {"ended": "timeout" or "exit"}
+
+Each exercise is called in a forked child, so that what it does to its process is gone with it.
+"""
+
+import os
+import select
+import signal
+import socket
+import sys
+from dataclasses import asdict
+
+import torch
+
+from course_lib.cases import decode, encode
+from course_lib.notebook import new_namespace, run_cell
+from course_lib.runner import observe
+
+
+class Channel:
+    """Frames over a stream socket: eight bytes of length, then that many bytes."""
+
+    def __init__(self, number: int) -> None:
+        self._socket = socket.socket(fileno=number)
+
+    def send(self, data) -> None:
+        payload = encode(data)
+        self._socket.sendall(len(payload).to_bytes(8, "big") + payload)
+
+    def receive(self):
+        return decode(self._read(int.from_bytes(self._read(8), "big")))
+
+    def _read(self, count: int) -> bytes:
+        chunks = []
+        while count:
+            chunk = self._socket.recv(min(count, 1 << 20))
+            if not chunk:
+                os._exit(0)  # the judge is done with us
+            chunks.append(chunk)
+            count -= len(chunk)
+        return b"".join(chunks)
+
+
+def load(channel: Channel, cells: list) -> dict:
+    """Run the cells in order in one namespace; tell the judge before each, so that it knows which one hung or ended the process."""
+    namespace = new_namespace()
+    failures = {}
+    for number, source in cells:
+        channel.send({"running": number})
+        try:
+            run_cell(source, namespace, f"cell {number}")
+        except (Exception, SystemExit, KeyboardInterrupt) as error:
+            failures[number] = f"{type(error).__name__}: {error!s:.300}"
+    channel.send({"loaded": failures})
+    return namespace
+
+
+def answer(channel: Channel, request: dict, namespace: dict) -> None:
+    """Call one exercise in a forked child, for `seconds` at most."""
+    child = os.fork()
+    if child == 0:
+        call(channel, request, namespace)
+    ended = wait(child, request["seconds"])
+    if ended:
+        channel.send({"ended": ended})
+
+
+def wait(child: int, seconds: float) -> str:
+    """Wait for a child; kill it after `seconds`. Returns "" if it ended well, "timeout" or "exit"."""
+    handle = os.pidfd_open(child)
+    in_time = select.select([handle], [], [], seconds)[0]
+    if not in_time:
+        os.kill(child, signal.SIGKILL)
+    os.close(handle)
+    _, status = os.waitpid(child, 0)
+    return "timeout" if not in_time else "exit" if status else ""
+
+
+def call(channel: Channel, request: dict, namespace: dict) -> None:
+    """In the child: observe the function on every case, answer, and end without running anybody's clean-up."""
+    torch.set_num_threads(1)  # a pool of threads does not survive a fork
+    status = 1
+    try:
+        function = namespace.get(request["exercise"])
+        if callable(function):
+            seen = [asdict(observe(function, case["arguments"], case["differentiate"])) for case in request["cases"]]
+            channel.send({"observations": seen})
+        else:
+            channel.send({"missing": True})
+        status = 0
+    finally:
+        os._exit(status)
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    channel = Channel(int(sys.argv[1]))
+    channel.send({"ready": True})
+    namespace = load(channel, channel.receive()["cells"])
+    while True:
+        answer(channel, channel.receive(), namespace)
+
+
+if __name__ == "__main__":
+    main()
