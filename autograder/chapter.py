@@ -19,7 +19,7 @@ from autograder import paths
 ANSWER_LINE = "*Write your answer here.*"
 
 _FRONT_MATTER = {"chapter": int, "title": str, "minutes": int, "prerequisites": list, "builds": str, "summary": str}
-_ABOUT_THE_FORMAT = {"jupytext", "kernelspec"}
+_ABOUT_THE_FORMAT = {"jupytext", "kernelspec", "jupyter", "source_map"}
 _OPTIONS = {"tags": list, "exercise": str, "difficulty": int, "minutes": int, "alt": str}
 _QUESTION = {"open_question": str, "points": (int, float)}
 _TAGS = {"live", "book-only", "full-width", "margin", "output_scroll", "raises-exception"} | {
@@ -118,7 +118,7 @@ def parse(path: Path) -> Chapter:
         notebook = myst_to_notebook(text, add_source_map=True)
     except (MystMetadataParsingError, yaml.YAMLError) as error:
         raise ChapterError(path, 1, f"unreadable options: {error}") from error
-    front = {key: value for key, value in notebook.metadata.items() if key not in _ABOUT_THE_FORMAT | {"source_map"}}
+    front = {key: value for key, value in notebook.metadata.items() if key not in _ABOUT_THE_FORMAT}
     _expect(path, 1, "front matter", front, _FRONT_MATTER, required=set(_FRONT_MATTER))
     if not path.name.startswith(f"ch{front['chapter']}_"):
         raise ChapterError(path, 1, f"chapter {front['chapter']} must lie in a file called ch{front['chapter']}_*.md")

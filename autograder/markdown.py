@@ -213,25 +213,20 @@ def _rendered(block: Block, dialect: Dialect) -> str:
 
 def _inline(text: str, dialect: Dialect, line: int) -> str:
     """Replace roles and links to chapters; leave code spans and inline maths alone."""
-    parts, end = [], 0
-    for match in _INLINE.finditer(text):
-        here = line + text.count("\n", 0, match.start())
-        parts.append(_plain(text[end : match.start()], line + text.count("\n", 0, end)))
+    _refuse(_INLINE.sub(lambda match: re.sub(r"[^\n]", "x", match[0]), text), line)
+
+    def replace(match: re.Match[str]) -> str:
         if match["role"]:
-            parts.append(dialect.role(match["role"], match["content"].strip(), here))
-        elif match["chapter"]:
-            parts.append(dialect.chapter(int(match["chapter"]), match["text"]))
-        else:
-            parts.append(match[0])
-        end = match.end()
-    return "".join(parts) + _plain(text[end:], line + text.count("\n", 0, end))
+            return dialect.role(match["role"], match["content"].strip(), line + text.count("\n", 0, match.start()))
+        return dialect.chapter(int(match["chapter"]), match["text"]) if match["chapter"] else match[0]
+
+    return _INLINE.sub(replace, text)
 
 
-def _plain(text: str, line: int) -> str:
+def _refuse(text: str, line: int) -> None:
     for pattern, message in _REFUSED:
         if match := pattern.search(text):
             raise MarkdownError(line + text.count("\n", 0, match.start()), message)
-    return text
 
 
 def parse(text: str, line: int = 1) -> list[Block]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
@@ -33,7 +34,8 @@ class References:
         style = find_plugin("pybtex.style.formatting", "plain")()
         backend = find_plugin("pybtex.backends", "markdown")()
         formatted = style.format_bibliography(self._data, sorted(keys))
-        return "\n".join(f"- {entry.text.render(backend)}" for entry in formatted)
+        works = (entry.text.render(backend).replace("\n", " ") for entry in formatted)
+        return "\n".join("- " + re.sub(r"\\([.()-])", r"\1", work) for work in works)  # escapes that these texts do not need
 
 
 def _authors(entry: Entry) -> str:
