@@ -1,0 +1,328 @@
+"""One chapter, three renderings: a page for the book, a notebook for learners, a source notebook for nbgrader.
+
+    chapter → executable_view → (the book builder runs it) → book_view, student_view, nbgrader_view
+
+All views are nbformat 4.5 and the same bytes for the same input. Cell ids follow from positions and names, and are the same in all views:
+`ch44-007` for the chapter's own cells, `ch44-test_compute_gae` for the check after a stub. `outputs` is always the executed
+notebook that `executable_view` gave. Errors are ChapterErrors that name file and line.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from nbformat import NotebookNode
+from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
+
+from autograder import markdown
+from autograder.chapter import ANSWER_LINE, Cell, Chapter, ChapterError
+from autograder.contract import STUB, Reference, Sources, references
+from autograder.contract import sources as real_sources
+from autograder.references import References
+
+STUDENT_NOTEBOOK = "downloads/{assignment}.ipynb"  # where a book page links to, relative to the page's own folder
+FACETS = {
+    "values": "the right values",
+    "gradient": "gradient to the right inputs, and to no others",
+    "dtype": "dtype and device of the inputs kept",
+    "inputs": "inputs left unchanged",
+    "errors": "errors that name the argument",
+}
+_LEVELS = {1: "●○○ (1 of 3)", 2: "●●○ (2 of 3)", 3: "●●● (3 of 3)"}
+_ANSI = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """What a chapter asks for: names and points, in the chapter's order."""
+
+    id: str
+    exercises: tuple[tuple[str, float], ...]
+    open_questions: tuple[tuple[str, float], ...]
+
+
+def assignment(chapter: Chapter, sources: Sources | None = None) -> Assignment:
+    """The graded items of a chapter."""
+    sources = sources or real_sources(chapter)
+    return Assignment(
+        chapter.assignment,
+        tuple((str(cell.exercise), float(sources.exercise(str(cell.exercise)).points)) for cell in chapter.exercises),
+        tuple((str(cell.open_question), float(cell.points)) for cell in chapter.open_questions),
+    )
+
+
+def verify(chapter: Chapter, sources: Sources | None = None) -> None:
+    """Raise ChapterError unless the chapter keeps its contract: exercises, references and checks agree, and all views render."""
+    sources = sources or real_sources(chapter)
+    student_view(chapter, sources=sources)
+    book_view(chapter, executable_view(chapter, sources), sources=sources)
+
+
+def executable_view(chapter: Chapter, sources: Sources | None = None) -> NotebookNode:
+    """The notebook that the book builder runs: all code cells, each stub replaced by an import of the reference."""
+    sources = sources or real_sources(chapter)
+    references(chapter, sources)
+    cells = []
+    for key, cell in _keyed(chapter):
+        if cell.exercise:
+            cells.append(_code(key, f"from {sources.solutions.__name__} import {cell.exercise}"))
+            cells.append(_code(_test_key(chapter, cell), f"check({cell.exercise})"))
+        elif cell.kind == "code":
+            cells.append(_code(key, cell.source, cell.tags))
+    return _notebook(cells)
+
+
+def book_view(chapter: Chapter, outputs: NotebookNode, with_solutions: bool = True, sources: Sources | None = None) -> NotebookNode:
+    """The page as MyST for Jupyter Book (`execute_notebooks: "off"`): stubs, executed outputs, folded references.
+
+    The page links to `STUDENT_NOTEBOOK`, which must lie there when Sphinx runs. Nothing of a reference is in it if not with_solutions.
+    """
+    sources = sources or real_sources(chapter)
+    solutions = references(chapter, sources)
+    executed = _outputs(chapter, outputs)
+
+    def stub(key: str, cell: Cell) -> Iterator[NotebookNode]:
+        yield _code(key, cell.source)
+        yield _code(_test_key(chapter, cell), f"check({cell.exercise})", outputs=executed(_test_key(chapter, cell)))
+        if with_solutions:
+            yield _markdown(f"{key}-reference", _folded(solutions[str(cell.exercise)]))
+
+    def code(key: str, cell: Cell) -> NotebookNode:
+        node = _code(key, cell.source, cell.tags - {"live", "book-only"}, executed(key))
+        if cell.alt:
+            node.metadata["mystnb"] = {"image": {"alt": cell.alt}}
+        return node
+
+    def question(key: str, cell: Cell, text: str) -> NotebookNode:
+        return _markdown(key, text.removesuffix(ANSWER_LINE).rstrip())
+
+    dialect = _dialect(markdown.Book, chapter, sources)
+    link = STUDENT_NOTEBOOK.format(assignment=chapter.assignment)
+    download = f"\n- **Notebook:** {{download}}`{chapter.assignment}.ipynb <{link}>`"
+    page = _notebook(_page(chapter, sources, dialect, download, stub, code, question))
+    if widgets := outputs.metadata.get("widgets"):
+        page.metadata["widgets"] = widgets
+    return page
+
+
+def student_view(chapter: Chapter, outputs: NotebookNode | None = None, sources: Sources | None = None) -> NotebookNode:
+    """The learner's notebook: plain Markdown, stubs, locked checks; what only the book can run, as recorded output.
+
+    Without `outputs` such cells become a sentence that says where to see the result.
+    """
+    return _learner_view(chapter, outputs, sources, teacher=False)
+
+
+def nbgrader_view(chapter: Chapter, outputs: NotebookNode | None = None, sources: Sources | None = None) -> NotebookNode:
+    """nbgrader's source notebook: the student view with solution regions and hidden tests.
+
+    What `nbgrader generate_assignment` makes of it, under release.write_nbgrader_course's configuration, is the student view.
+    """
+    return _learner_view(chapter, outputs, sources, teacher=True)
+
+
+def _learner_view(chapter: Chapter, outputs: NotebookNode | None, sources: Sources | None, teacher: bool) -> NotebookNode:
+    sources = sources or real_sources(chapter)
+    solutions = references(chapter, sources)
+    executed = _outputs(chapter, outputs) if outputs else None
+
+    def stub(key: str, cell: Cell) -> Iterator[NotebookNode]:
+        name = str(cell.exercise)
+        source, test = cell.source, f"check({name})"
+        if teacher:
+            reference = solutions[name]
+            source = source.removesuffix(STUB) + f"### BEGIN SOLUTION\n{reference.body}\n    ### END SOLUTION"
+            call = f'from autograder.hub import score\nscore("{name}", {name})'
+            test += f"\n### BEGIN HIDDEN TESTS\n{call}\n### END HIDDEN TESTS"
+        yield _graded(_code(key, source), name, solution=True)
+        yield _graded(_code(_test_key(chapter, cell), test), f"test_{name}", points=sources.exercise(name).points)
+
+    def code(key: str, cell: Cell) -> NotebookNode:
+        if "book-only" in cell.tags:
+            return _recorded(key, cell, executed(key) if executed else None, chapter)
+        node = _code(key, cell.source, cell.tags)
+        if cell.tags & {"hide-input", "hide-cell"}:
+            node.metadata["jupyter"] = {"source_hidden": True}
+        return node
+
+    def question(key: str, cell: Cell, text: str) -> NotebookNode:
+        if teacher:
+            text = text.removesuffix(ANSWER_LINE) + f"### BEGIN SOLUTION\n{ANSWER_LINE}\n### END SOLUTION"
+        return _graded(_markdown(key, text), str(cell.open_question), solution=True, points=cell.points)
+
+    dialect = _dialect(markdown.Plain, chapter, sources)
+    return _notebook(_page(chapter, sources, dialect, "", stub, code, question))
+
+
+def _page(
+    chapter: Chapter,
+    sources: Sources,
+    dialect: markdown.Dialect,
+    extra: str,
+    stub: Callable[[str, Cell], Iterable[NotebookNode]],
+    code: Callable[[str, Cell], NotebookNode],
+    question: Callable[[str, Cell, str], NotebookNode],
+) -> Iterator[NotebookNode]:
+    """The cells of a page in order: what the views share, with their own ways to write stubs, code and questions."""
+    yield _markdown(f"{chapter.assignment}-front", _render(_front(chapter, sources), dialect, chapter, 1) + extra)
+    level, number = 2, 0
+    for key, cell in _keyed(chapter):
+        if cell.exercise:
+            number += 1
+            yield _markdown(f"{key}-heading", _heading(cell, level, f"{chapter.number}.{number}", sources))
+            yield from stub(key, cell)
+        elif cell.kind == "code":
+            yield code(key, cell)
+        else:
+            text = _render(cell.source, dialect, chapter, cell.line)
+            level = 3 if re.search(r"^##+ ", text, re.MULTILINE) else level
+            if cell.open_question:
+                yield question(key, cell, f"**Open question** ({_points(cell.points)}, graded by a person)\n\n{text}")
+            else:
+                yield _markdown(key, text)
+    if dialect.cited:
+        yield _markdown(f"{chapter.assignment}-references", f"## References\n\n{dialect.bibliography()}")
+
+
+def _front(chapter: Chapter, sources: Sources) -> str:
+    """The title and the facts under it, in the chapters' own Markdown."""
+    before = ", ".join(f"[chapter {number}](chapter:{number})" for number in chapter.prerequisites)
+    graded = [f"{len(chapter.exercises)} exercises ({_points(sum(exercise.points for exercise in sources.exercises))})"]
+    if chapter.open_questions:
+        total = _points(sum(cell.points for cell in chapter.open_questions))
+        graded.append(f"open questions for a teacher ({total})")
+    lines = [
+        f"# {chapter.number}. {chapter.title}\n",
+        f"- **Time:** {_duration(chapter.minutes)}",
+        f"- **Before this:** {before}" if before else "",
+        f"- **You will have built:** {chapter.builds}",
+        f"- **Graded:** {', '.join(graded)}",
+    ]
+    return "\n".join(line for line in lines if line)
+
+
+def _heading(cell: Cell, level: int, number: str, sources: Sources) -> str:
+    exercise = sources.exercise(str(cell.exercise))
+    rows = "\n".join(f"| {FACETS.get(name, name)} | {points:g} |" for name, points in exercise.criteria.items())
+    return (
+        f"{'#' * level} Exercise {number}: `{cell.exercise}`\n\n"
+        f"Difficulty {_LEVELS[cell.difficulty]} · {_duration(cell.minutes)} · {_points(exercise.points)}\n\n"
+        f"| What is checked | Points |\n|:--|--:|\n{rows}"
+    )
+
+
+def _folded(reference: Reference) -> str:
+    """A reference without its docstring, which stands in the stub just above, behind a click."""
+    return f"::::{{dropdown}} Reference solution\n````python\n{reference.signature}\n{reference.body}\n````\n::::"
+
+
+def _recorded(key: str, cell: Cell, outputs: list[NotebookNode] | None, chapter: Chapter) -> NotebookNode:
+    """What a book-only cell has shown in the book, as a markdown cell: pictures as attachments, text in a fence."""
+    parts, attachments = [], {}
+    for output in outputs or []:
+        data = output.get("data", {})
+        if "image/png" in data:
+            name = f"{key}-{len(attachments) + 1}.png"
+            attachments[name] = {"image/png": data["image/png"].strip()}
+            parts.append(f"![{cell.alt or 'recorded figure'}](attachment:{name})")
+        elif text := output.get("text", data.get("text/plain", "")).strip():
+            parts.append(f"````text\n{_ANSI.sub('', text)}\n````")
+    if not parts:
+        parts.append(f"*What belongs here is on the book's page of chapter {chapter.number}.*")
+    node = _markdown(key, "\n\n".join(parts), cell.tags)
+    if attachments:
+        node["attachments"] = attachments
+    return node
+
+
+def _dialect(kind: type[markdown.Dialect], chapter: Chapter, sources: Sources) -> markdown.Dialect:
+    """A dialect that knows the numbers of the chapter's equations."""
+    equations: dict[str, str] = {}
+    for cell in chapter.cells:
+        if cell.kind == "markdown":
+            for label, line in _located(chapter, cell.line, lambda cell=cell: list(markdown.labels(cell.source, cell.line))):
+                if label in equations:
+                    raise ChapterError(chapter.path, line, f"a second equation is labelled {label!r}")
+                equations[label] = f"{chapter.number}.{len(equations) + 1}"
+    return kind(chapter.assignment, equations, References(sources.references), sources.pages)
+
+
+def _render(text: str, dialect: markdown.Dialect, chapter: Chapter, line: int) -> str:
+    return _located(chapter, line, lambda: markdown.render(text, dialect, line))
+
+
+def _located(chapter: Chapter, line: int, call: Callable[[], Any]) -> Any:
+    try:
+        return call()
+    except markdown.MarkdownError as error:
+        raise ChapterError(chapter.path, error.line, str(error)) from error
+
+
+def _outputs(chapter: Chapter, executed: NotebookNode) -> Callable[[str], list[NotebookNode]]:
+    """Looks up a cell's outputs by the cell's id."""
+    known = {cell.id: cell.outputs for cell in executed.cells if cell.cell_type == "code"}
+
+    def find(key: str) -> list[NotebookNode]:
+        if key not in known:
+            raise ChapterError(chapter.path, 1, f"the executed notebook has no cell {key}: it belongs to another version of the chapter")
+        return known[key]
+
+    return find
+
+
+def _keyed(chapter: Chapter) -> Iterator[tuple[str, Cell]]:
+    for position, cell in enumerate(chapter.cells):
+        yield f"{chapter.assignment}-{position:03d}", cell
+
+
+def _test_key(chapter: Chapter, cell: Cell) -> str:
+    return f"{chapter.assignment}-test_{cell.exercise}"
+
+
+def _graded(cell: NotebookNode, name: str, *, solution: bool = False, points: float | None = None) -> NotebookNode:
+    """Mark a cell for nbgrader: learners edit solutions, and neither edit nor delete checks."""
+    cell.metadata["nbgrader"] = {
+        "schema_version": 3,
+        "grade_id": name,
+        "grade": points is not None,
+        "solution": solution,
+        "locked": not solution,
+        "task": False,
+        "cell_type": cell.cell_type,
+    }
+    cell.metadata["deletable"] = False
+    if points is not None:
+        cell.metadata["nbgrader"]["points"] = float(points)
+    if not solution:
+        cell.metadata["editable"] = False
+    return cell
+
+
+def _code(key: str, source: str, tags: Iterable[str] = (), outputs: Iterable[NotebookNode] = ()) -> NotebookNode:
+    return new_code_cell(source, id=key, metadata=_tagged(tags), outputs=list(outputs))
+
+
+def _markdown(key: str, source: str, tags: Iterable[str] = ()) -> NotebookNode:
+    return new_markdown_cell(source, id=key, metadata=_tagged(tags))
+
+
+def _tagged(tags: Iterable[str]) -> dict[str, Any]:
+    return {"tags": sorted(tags)} if tags else {}
+
+
+def _notebook(cells: Iterable[NotebookNode]) -> NotebookNode:
+    kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
+    return new_notebook(cells=list(cells), metadata={"kernelspec": kernel, "language_info": {"name": "python"}})
+
+
+def _points(points: float) -> str:
+    return f"{points:g} point{'' if points == 1 else 's'}"
+
+
+def _duration(minutes: int) -> str:
+    hours, rest = divmod(minutes, 60)
+    words = [f"{hours} hour{'s' * (hours > 1)}"] * (hours > 0) + [f"{rest} minutes"] * (rest > 0)
+    return f"about {' '.join(words)}"
