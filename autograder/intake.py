@@ -77,7 +77,7 @@ def parse(content: bytes) -> nbformat.NotebookNode:
         document = json.loads(content.decode("utf-8-sig"))
         if not isinstance(document, dict):
             raise BadNotebook("The file is JSON but no notebook.")
-        if document.get("nbformat", 0) < 4:
+        if document.get("nbformat", 4) < 4:
             document = nbformat.convert(nbformat.from_dict(document), 4)
         return nbformat.from_dict({"nbformat": 4, "nbformat_minor": 5, "metadata": {}, "cells": [_cell(c) for c in document["cells"]]})
     except BadNotebook:

@@ -123,7 +123,8 @@ def _explanations(exercise: FrozenExercise, pairs: list[tuple[FrozenCase, Observ
             shown = case.misconceptions[name]
             signature |= min((differing_facets(shown, right, case) for right in case.expected), key=len)
             unlike |= differing_facets(seen, shown, case)
-        if signature and signature <= set(failed) and not signature & unlike:
+        explains_values = "values" in signature or "values" not in failed  # else it would name a scratch on a wreck
+        if signature and signature <= set(failed) and not signature & unlike and explains_values:
             explained[name] = signature
     return [name for name, facets in explained.items() if not any(facets < others for others in explained.values())]
 

@@ -75,7 +75,7 @@ def without_magics(source: str) -> str:
         if lines[0].split()[0] not in ("%%time", "%%timeit", "%%capture"):
             return ""
         lines = lines[1:]
-    return "\n".join("pass" if MAGIC.match(line) else line for line in lines)
+    return "\n".join(re.sub(r"\S.*", "pass", line) if MAGIC.match(line) else line for line in lines)
 
 
 def run_cells(cells: Sequence[dict[str, Any]], namespace: dict[str, Any]) -> dict[int, Exception]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import pkgutil
 
 from autograder.spec import Exercise
 
@@ -10,3 +11,9 @@ from autograder.spec import Exercise
 def exercises(assignment: str) -> tuple[Exercise, ...]:
     """The exercises of assignment "chNN", in the chapter's order. Raises ModuleNotFoundError if it has none."""
     return importlib.import_module(f"{__name__}.{assignment}").EXERCISES
+
+
+def all_exercises() -> list[Exercise]:
+    """The exercises of every chapter."""
+    names = sorted(module.name for module in pkgutil.iter_modules(__path__))
+    return [exercise for name in names for exercise in exercises(name)]

@@ -1,0 +1,114 @@
+"""The `course` command: book, release, check, grade, doctor."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+# Each command imports what it needs: torch, nbgrader and Sphinx cost seconds, and `course --help` should not.
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, help=__doc__)
+OK, LOW_SCORES, BAD_INPUT, BROKEN = 0, 1, 2, 3
+err = Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def _stop(message: object, status: int = BAD_INPUT) -> None:
+    err.print(f"course: {message}", markup=False)
+    raise typer.Exit(status)
+
+
+@app.command()
+def book(
+    without_solutions: Annotated[bool, typer.Option("--without-solutions", help="Leave the folded reference solutions out.")] = False,
+) -> None:
+    """Build the HTML book into book/_build/html."""
+    from autograder import book as builder
+
+    try:
+        print(f"The book is at {builder.build(with_solutions=not without_solutions) / 'index.html'}")
+    except (builder.BookError, ValueError) as error:
+        _stop(error, 1)
+
+
+@app.command()
+def release(
+    out: Annotated[Path, typer.Option(help="Where the bundle goes.")] = Path("release"),
+    only: Annotated[list[str] | None, typer.Option(help="Release this chapter only, as in --only ch44; may be repeated.")] = None,
+) -> None:
+    """Write the student bundle: notebooks, course_lib, and a zip of it all. Never overwrites a learner's work."""
+    from autograder import release as releaser
+
+    try:
+        print(f"The bundle is at {releaser.release(out, only)}")
+    except (ValueError, LookupError, OSError) as error:
+        _stop(error)
+
+
+@app.command()
+def check(notebook: Annotated[Path, typer.Argument(help="A student notebook.")]) -> None:
+    """Run the visible checks of one notebook, in this process: for your own code."""
+    from autograder import checks, freeze
+    from course_lib import check as command
+    from course_lib import checking
+
+    freeze.write(checks.all_exercises(), checking.FROZEN)
+    raise typer.Exit(command.main([str(notebook)]))
+
+
+@app.command()
+def grade(
+    submitted: Annotated[Path, typer.Argument(help="The folder that holds STUDENT/ASSIGNMENT/ASSIGNMENT.ipynb.")],
+    out: Annotated[Path, typer.Option(help="Where verdicts, tables, reports and the gradebook go.")] = Path("grades"),
+    jobs: Annotated[int, typer.Option(min=1, help="Submissions judged at a time.")] = os.cpu_count() or 1,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler, tcp://…, instead of --jobs.")] = None,
+    timeout: Annotated[float, typer.Option(min=0.1, help="Seconds for each exercise, and for loading a notebook.")] = 60.0,
+    db_url: Annotated[str | None, typer.Option(help="nbgrader's gradebook; sqlite:///OUT/gradebook.db by default.")] = None,
+    fail_under: Annotated[float | None, typer.Option(min=0.0, max=1.0, help="Exit with 1 if a submission scores less than this share.")] = None,
+    trust_submissions: Annotated[
+        bool, typer.Option("--trust-submissions", help="Run WITHOUT a sandbox. For your own code only: it can do all that you can.")
+    ] = False,
+) -> None:
+    """Grade all submissions in a folder. Exit status: 0 all have a verdict, 1 below --fail-under, 2 bad input, 3 the grader failed."""
+    from autograder import exports, grade, sandbox
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=err, transient=True) as bar:
+        task = bar.add_task("grading", total=None)
+        try:
+            results = grade.grade(
+                submitted, out, jobs, scheduler, timeout, db_url, trust_submissions,
+                lambda done, total, name: bar.update(task, completed=done, total=total),
+            )  # fmt: skip
+        except (grade.GradingError, sandbox.SandboxUnavailable) as error:
+            bar.stop()
+            _stop(error)
+    Console(highlight=False).print(exports.table(results))
+    print(f"Grades are in {out}")
+    if any(verdict.status == "infra_error" for verdict in results):
+        _stop("some submissions could not be graded (infra_error): grade again; `course doctor` looks for the cause", BROKEN)
+    low = [v for v in results if fail_under is not None and v.score < fail_under * v.max_score or v.status == "student_error" and fail_under]
+    if low:
+        _stop(f"{len(low)} of {len(results)} submissions score under {fail_under:.0%}", LOW_SCORES)
+
+
+@app.command()
+def doctor() -> None:
+    """Say what works on this machine, and how to mend what does not."""
+    from autograder import doctor
+
+    raise typer.Exit(doctor.report())
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    app()
+
+
+if __name__ == "__main__":
+    sys.exit(app())

@@ -1,0 +1,97 @@
+"""What an observation holds: values, gradients, graphs, dtypes, changed inputs, exceptions."""
+
+import warnings
+
+import numpy as np
+import torch
+
+from course_lib.cases import Observation
+from course_lib.runner import observe
+
+X = {"x": np.array([1.0, 2.0, 3.0]), "scale": 2.0}
+
+
+def test_a_tensor_and_its_gradient():
+    seen = observe(lambda x, scale: scale * x, X, ["x"])
+    assert seen.kind == "tensor" and seen.outputs[""].tolist() == [2, 4, 6] and seen.graph == [""]
+    np.testing.assert_allclose(seen.gradients["x"], 2 * np.cos([0, 1, 2]))
+
+
+def test_a_detached_result_has_no_gradient_and_no_graph():
+    seen = observe(lambda x, scale: (scale * x).detach(), X, ["x"])
+    assert seen.gradients == {"x": None} and seen.graph == []
+
+
+def test_a_gradient_of_zeros_counts_as_none():
+    assert observe(lambda x, scale: x * 0, X, ["x"]).gradients == {"x": None}
+
+
+def test_tuples_and_dicts_are_taken_apart():
+    assert list(observe(lambda x, scale: (x, x + 1), X).outputs) == ["0", "1"]
+    assert observe(lambda x, scale: {"b": x, "a": x}, X).kind == "dict of a, b"
+
+
+def test_other_results_are_named_by_type():
+    assert observe(lambda x, scale: 3.0, X) == Observation(kind="float")
+    assert observe(lambda x, scale: None, X).kind == "NoneType"
+
+
+def test_changed_inputs_are_noticed_even_if_they_require_gradient():
+    def in_place(x, scale):
+        x += 1
+        return x
+
+    assert observe(in_place, X).mutated == ["x"]
+    assert observe(in_place, X, ["x"]).mutated == ["x"]
+    assert X["x"].tolist() == [1, 2, 3]
+
+
+def test_an_exception_is_observed_not_raised():
+    def broken(x, scale):
+        raise IndexError("no such step")
+
+    seen = observe(broken, X)
+    assert (seen.error, seen.message) == ("IndexError", "no such step")
+
+
+def test_an_exception_without_a_text_is_still_observed():
+    class Rude(Exception):
+        def __str__(self):
+            raise RuntimeError
+
+    def broken(x, scale):
+        raise Rude
+
+    assert observe(broken, X).error == "Rude"
+
+
+def test_renamed_parameters_go_by_position():
+    assert observe(lambda tensor, factor: tensor * factor, X).outputs[""].tolist() == [2, 4, 6]
+
+
+def test_a_warning_costs_nothing():
+    def noisy(x, scale):
+        warnings.warn("deprecated", stacklevel=1)
+        return x
+
+    assert observe(noisy, X).error == ""
+
+
+def test_a_graph_broken_in_place_gives_no_number_for_a_gradient():
+    def broken(x, scale):
+        y = x.exp()
+        z = y * y
+        y += 1
+        return z
+
+    assert np.isnan(observe(broken, X, ["x"]).gradients["x"]).all()
+
+
+def test_single_precision_inputs_stay_single():
+    assert observe(lambda x: x, {"x": np.zeros(2, np.float32)}).outputs[""].dtype == np.float32
+
+
+def test_flags_and_indices_keep_their_dtypes():
+    kinds = {}
+    observe(lambda mask, ids: kinds.update(mask=mask.dtype, ids=ids.dtype), {"mask": np.array([True]), "ids": np.array([3])})
+    assert kinds == {"mask": torch.bool, "ids": torch.int64}
