@@ -1,0 +1,121 @@
+"""Small environments whose exact values are known, so that an estimate can be compared with the truth."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+
+class ChainVectorEnv(gym.vector.VectorEnv):
+    """A row of cells: a one-off payment at the left end, a steady wage at the right end.
+
+    Cells are numbered 0 to length - 1 and every episode starts in the middle one. Action 0 steps left, action 1 right; with
+    probability `slip` the step goes the other way, and the right wall holds whoever walks into it. Reaching cell 0 pays
+    `exit_reward` and *terminates* the episode: the task is over. A step that ends in the last cell pays 1, for as long as one
+    stays. After `time_limit` steps the episode is *truncated*: the limit is a convenience of data collection, the task
+    itself would go on. Every reward carries normal noise of standard deviation `reward_noise`.
+
+    Gymnasium's vector interface with same-step autoreset: where an episode ends, `step` returns the first observation of the
+    next one, and the true last observation is in `info["final_obs"]`.
+
+    Args:
+      num_envs: N chains, stepped together.
+      length: number of cells, at least 3.
+      time_limit: steps to truncation, or None for none.
+      exit_reward: paid once at cell 0, in units of reward.
+      slip: probability in [0, 1] that a step goes the other way.
+      reward_noise: standard deviation of the noise, in units of reward.
+
+    Observations: (N, 1) float32, the cell scaled to [-1, 1].
+    Raises: ValueError if length, time_limit, slip or reward_noise is out of range.
+    """
+
+    def __init__(self, num_envs=16, length=7, time_limit=10, exit_reward=8.0, slip=0.1, reward_noise=0.3):
+        if length < 3:
+            raise ValueError(f"length must be at least 3, got {length}")
+        if time_limit is not None and time_limit < 1:
+            raise ValueError(f"time_limit must be at least 1 or None, got {time_limit}")
+        if not 0 <= slip <= 1:
+            raise ValueError(f"slip must lie in [0, 1], got {slip}")
+        if reward_noise < 0:
+            raise ValueError(f"reward_noise must not be negative, got {reward_noise}")
+        self.num_envs, self.length, self.time_limit = num_envs, length, time_limit
+        self.exit_reward, self.slip, self.reward_noise = exit_reward, slip, reward_noise
+        self.start = length // 2
+        self.single_observation_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.single_action_space = gym.spaces.Discrete(2)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        self.cells = np.full(num_envs, self.start)
+        self.elapsed = np.zeros(num_envs, dtype=int)
+
+    def observe(self, cells):
+        """Scale cells, an integer array of any shape, to observations with a trailing axis of 1."""
+        return (2 * np.asarray(cells)[..., None] / (self.length - 1) - 1).astype(np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        """Start all episodes; `options={"cells": array}` places them elsewhere than in the middle."""
+        super().reset(seed=seed)
+        self.cells[:] = self.start if options is None else options["cells"]
+        self.elapsed[:] = 0
+        return self.observe(self.cells), {}
+
+    def step(self, actions):
+        """Move every chain by one step; see the class for what ends an episode."""
+        slipped = self.np_random.random(self.num_envs) < self.slip
+        right = (np.asarray(actions) == 1) ^ slipped
+        self.cells = np.minimum(self.cells + np.where(right, 1, -1), self.length - 1)
+        self.elapsed += 1
+        terminated = self.cells == 0
+        truncated = ~terminated & (self.elapsed == self.time_limit)
+        rewards = self.exit_reward * terminated + (self.cells == self.length - 1)
+        rewards = rewards + self.reward_noise * self.np_random.standard_normal(self.num_envs)
+
+        ended = terminated | truncated
+        info = {}
+        if ended.any():
+            info = {"final_obs": self.observe(self.cells), "_final_obs": ended}
+            self.cells = np.where(ended, self.start, self.cells)
+            self.elapsed = np.where(ended, 0, self.elapsed)
+        return self.observe(self.cells), rewards, terminated, truncated, info
+
+    def model(self):
+        """The exact dynamics: transitions P(s' | s, a), (2, length, length) by action, and mean rewards r(s, a), (2, length).
+
+        Row 0 is zero: nothing follows the exit.
+        """
+        transitions = np.zeros((2, self.length, self.length))
+        for cell in range(1, self.length):
+            left, right = cell - 1, min(cell + 1, self.length - 1)
+            transitions[:, cell, left] += 1 - self.slip, self.slip
+            transitions[:, cell, right] += self.slip, 1 - self.slip
+        landing_rewards = np.zeros(self.length)
+        landing_rewards[0], landing_rewards[-1] = self.exit_reward, 1
+        return transitions, transitions @ landing_rewards
+
+    def values(self, right_probability, gamma):
+        """The exact V of a policy in the task without time limit.
+
+            V = (I - γ P)⁻¹ r,   V(0) = 0
+
+        Bellman's equations are linear in V; Sutton and Barto (2018), section 4.1.
+
+        Args:
+          right_probability: π(right | s) of every cell, (length,), or one number for all; cell 0 counts for nothing.
+          gamma: discount per step, in [0, 1).
+
+        Returns: (length,) float64, in units of reward.
+        """
+        transitions, rewards = self.model()
+        right = np.broadcast_to(np.asarray(right_probability, dtype=float), self.length)
+        policy = np.stack([1 - right, right])
+        mean_transitions = np.einsum("as,ast->st", policy, transitions)
+        return np.linalg.solve(np.eye(self.length) - gamma * mean_transitions, (policy * rewards).sum(0))
+
+    def action_values(self, right_probability, gamma):
+        """The exact Q(s, a) = r(s, a) + γ Σ P(s' | s, a) V(s'): (length, 2) float64; arguments as for `values`."""
+        transitions, rewards = self.model()
+        return (rewards + gamma * transitions @ self.values(right_probability, gamma)).T

@@ -1,0 +1,73 @@
+"""Collecting transitions from vector environments, with the true successor of every step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """T steps of N environments, time-major; `next_obs` is the true successor, never an observation after a reset."""
+
+    obs: torch.Tensor  # (T, N, *obs)
+    actions: torch.Tensor  # (T, N, *act), as the policy returned them
+    rewards: torch.Tensor  # (T, N)
+    next_obs: torch.Tensor  # (T, N, *obs)
+    terminated: torch.Tensor  # (T, N) bool
+    truncated: torch.Tensor  # (T, N) bool
+
+
+def true_next_obs(obs, info):
+    """What each step led to: `obs` as `step` returned it, with `info["final_obs"]` where an episode ended.
+
+    Args:
+      obs: (N, *obs), the observations that `step` returned under same-step autoreset.
+      info: the info that came with them.
+
+    Returns: (N, *obs) array of its own.
+    """
+    successors = np.array(obs)
+    for i in np.flatnonzero(info.get("_final_obs", ())):
+        successors[i] = info["final_obs"][i]
+    return successors
+
+
+def collect(envs, policy, num_steps, obs):
+    """Step `envs` num_steps times with `policy`, carrying on where the last rollout stopped.
+
+    Args:
+      envs: a vector environment with same-step autoreset.
+      policy: obs (N, *obs) float32 tensor -> actions (N, *act) tensor; called without gradient.
+      num_steps: T.
+      obs: (N, *obs), from `envs.reset` or from the last call.
+
+    Returns: (Rollout in float32, the observations (N, *obs) to start the next rollout from).
+    Raises: ValueError if envs resets in another way than in the same step: with Gymnasium's default (next-step) every end of an
+      episode is followed by a transition that never happened.
+    """
+    mode = envs.metadata.get("autoreset_mode")
+    if mode != AutoresetMode.SAME_STEP:
+        raise ValueError(
+            f"envs must use same-step autoreset, got {mode}; pass autoreset_mode=AutoresetMode.SAME_STEP to the vector environment"
+        )
+    columns = []
+    for _ in range(num_steps):
+        before = torch.as_tensor(obs, dtype=torch.float32)
+        with torch.no_grad():
+            actions = policy(before)
+        obs, rewards, terminated, truncated, info = envs.step(actions.numpy())
+        columns.append((before, actions, rewards, true_next_obs(obs, info), terminated, truncated))
+    before, actions, rewards, successors, terminated, truncated = zip(*columns, strict=True)
+    rollout = Rollout(
+        obs=torch.stack(before),
+        actions=torch.stack(actions),
+        rewards=torch.as_tensor(np.stack(rewards), dtype=torch.float32),
+        next_obs=torch.as_tensor(np.stack(successors), dtype=torch.float32),
+        terminated=torch.as_tensor(np.stack(terminated)),
+        truncated=torch.as_tensor(np.stack(truncated)),
+    )
+    return rollout, obs

@@ -1,0 +1,19 @@
+"""One way to seed everything a run draws from."""
+
+from __future__ import annotations
+
+import random
+
+import numpy as np
+import torch
+
+
+def seed_everything(seed: int) -> torch.Generator:
+    """Seed Python, NumPy and torch, and return a torch generator of the same seed for explicit draws.
+
+    Environments are seeded apart, by `envs.reset(seed=seed)`.
+    """
+    random.seed(seed)
+    np.random.seed(seed)
+    torch.manual_seed(seed)
+    return torch.Generator().manual_seed(seed)

@@ -1,0 +1,71 @@
+// Draws the precomputed series of one explorer and redraws when a slider or the width changes. No dependency, no request.
+((figure) => {
+  const data = JSON.parse(figure.querySelector("script[type='application/json']").textContent);
+  const sliders = [...figure.querySelectorAll("input[type=range]")];
+  const svgs = [...figure.querySelectorAll("svg")];
+  const short = (v) => (v === null ? "none" : String(Number(v.toPrecision(3))));
+  const make = (parent, name, attributes, text) => {
+    const node = parent.appendChild(document.createElementNS("http://www.w3.org/2000/svg", name));
+    for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
+    if (text !== undefined) node.textContent = text;
+    return node;
+  };
+  const ticks = (low, high, count) => {
+    const raw = (high - low) / count, power = 10 ** Math.floor(Math.log10(raw));
+    const step = [1, 2, 5, 10].map((m) => m * power).find((s) => s >= raw);
+    const marks = [];
+    for (let v = Math.ceil(low / step) * step; v <= high + step * 1e-6; v += step) marks.push(Number(v.toFixed(9)));
+    return marks;
+  };
+  const drawPanel = (svg, panel, values) => {
+    const width = Math.max(svg.parentElement.clientWidth, 260), height = 210;
+    const [left, right, top, bottom] = [46, 8, 10, 40];
+    const x = (v) => left + ((v - panel.x[0]) / (panel.x[1] - panel.x[0])) * (width - left - right);
+    const y = (v) => height - bottom - ((v - panel.y[0]) / (panel.y[1] - panel.y[0])) * (height - top - bottom);
+    svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
+    svg.setAttribute("height", height);
+    svg.replaceChildren();
+    for (const v of ticks(...panel.y, 4)) {
+      make(svg, "line", {x1: left, x2: width - right, y1: y(v), y2: y(v), class: v === 0 ? "zero" : "grid"});
+      make(svg, "text", {x: left - 5, y: y(v) + 4, "text-anchor": "end"}, short(v));
+    }
+    for (const v of ticks(...panel.x, width < 420 ? 5 : 10))
+      make(svg, "text", {x: x(v), y: height - bottom + 16, "text-anchor": "middle"}, short(v));
+    make(svg, "text", {x: (left + width - right) / 2, y: height - 6, "text-anchor": "middle"}, data.xLabel);
+    panel.series.forEach((index) => {
+      const series = data.series[index];
+      const points = series.x.map((v, i) => [v, values[index][i]]).filter((p) => p[1] !== null);
+      const paint = {class: `${series.kind} c${index % 5}`};
+      if (series.kind === "line")
+        make(svg, "polyline", {...paint, points: points.map((p) => `${x(p[0])},${y(p[1])}`).join(" ")});
+      const bar = Math.max(2, (0.6 * (width - left - right)) / (series.x.length + 1));
+      for (const [px, py] of points) {
+        if (series.kind === "bar")
+          make(svg, "rect", {...paint, x: x(px) - bar / 2, width: bar, y: Math.min(y(py), y(0)), height: Math.abs(y(py) - y(0))});
+        else make(svg, "circle", {class: `points c${index % 5}`, cx: x(px), cy: y(py), r: series.kind === "line" ? 2.5 : 4});
+      }
+    });
+    svg.setAttribute("aria-label", panel.label + ". " + panel.series.map((index) => {
+      const kept = values[index].filter((v) => v !== null);
+      return `${data.series[index].name}: from ${short(Math.min(...kept))} to ${short(Math.max(...kept))}`;
+    }).join("; "));
+  };
+  const draw = () => {
+    let combination = 0;
+    sliders.forEach((slider, i) => {
+      const choices = data.sliders[i].values, chosen = String(choices[slider.value]);
+      combination = combination * choices.length + Number(slider.value);
+      slider.setAttribute("aria-valuetext", chosen);
+      slider.parentElement.querySelector("output").textContent = chosen;
+    });
+    const values = data.values[combination];
+    svgs.forEach((svg, i) => drawPanel(svg, data.panels[i], values));
+    figure.querySelectorAll("tbody tr").forEach((row, i) => {
+      const cells = row.querySelectorAll("td");
+      values[i].forEach((v, j) => { if (cells[j]) cells[j].textContent = v === null ? "" : short(v); });
+    });
+  };
+  sliders.forEach((slider) => slider.addEventListener("input", draw));
+  new ResizeObserver(draw).observe(figure);
+  draw();
+})(document.currentScript.closest("figure"));
