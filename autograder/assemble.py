@@ -1,14 +1,16 @@
 """One chapter, three renderings: a page for the book, a notebook for learners, a source notebook for nbgrader.
 
-All views are nbformat 4.5 and the same bytes for the same input. Cell ids follow from positions and names, and are the same in all views:
-`ch44-007` for the chapter's own cells, `ch44-test_compute_gae` for the check after a stub. `outputs` always has one list of outputs for
-each code cell of the chapter, in order; a stub's are those of its check. Errors are ChapterErrors that name file and line.
+All views are nbformat 4.5 and the same bytes for the same input. Cell ids follow from positions and names, and are the same in
+all views: `ch44-007` for the chapter's own cells, `ch44-test_compute_gae` for the check after a stub. `outputs` always has one
+list of outputs for each code cell of the chapter, in order; a stub's are those of its check. Errors are ChapterErrors that name
+file and line.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -194,7 +196,8 @@ def _folded(reference: Reference) -> str:
 
 def _recorded(key: str, cell: Cell, outputs: list[NotebookNode], chapter: Chapter) -> NotebookNode:
     """What a book-only cell has shown in the book, as a markdown cell: pictures as attachments, text in a fence."""
-    parts, attachments = [], {}
+    parts: list[str] = []
+    attachments: dict[str, dict[str, str]] = {}
     for output in outputs:
         data = output.get("data", {})
         if "image/png" in data:
@@ -216,7 +219,9 @@ def _dialect(kind: type[markdown.Dialect], chapter: Chapter, sources: Sources) -
     equations: dict[str, str] = {}
     for cell in chapter.cells:
         if cell.kind == "markdown":
-            for label, line in _located(chapter, cell.line, lambda cell=cell: list(markdown.labels(cell.source, cell.line))):
+            with _located(chapter):
+                found = list(markdown.labels(cell.source, cell.line))
+            for label, line in found:
                 if label in equations:
                     raise ChapterError(chapter.path, line, f"a second equation is labelled {label!r}")
                 equations[label] = f"{chapter.number}.{len(equations) + 1}"
@@ -224,12 +229,15 @@ def _dialect(kind: type[markdown.Dialect], chapter: Chapter, sources: Sources) -
 
 
 def _render(text: str, dialect: markdown.Dialect, chapter: Chapter, line: int) -> str:
-    return _located(chapter, line, lambda: markdown.render(text, dialect, line))
+    with _located(chapter):
+        return markdown.render(text, dialect, line)
 
 
-def _located(chapter: Chapter, line: int, call: Callable[[], Any]) -> Any:
+@contextmanager
+def _located(chapter: Chapter) -> Iterator[None]:
+    """Adds the file's name to the errors of its Markdown."""
     try:
-        return call()
+        yield
     except markdown.MarkdownError as error:
         raise ChapterError(chapter.path, error.line, str(error)) from error
 

@@ -33,7 +33,7 @@ _INLINE = re.compile(
 _REFUSED = [
     (re.compile(r"^\([\w:-]+\)=\s*$", re.MULTILINE), "targets `(label)=` are not used: notebooks cannot show them"),
     (re.compile(r"^%", re.MULTILINE), "MyST comments are not used: notebooks would print them"),
-    (re.compile(r"(?<!\\)\$"), "this $ has no partner: maths is $x$ within one paragraph, or $$ … $$ on lines of its own; money is \\$5"),
+    (re.compile(r"(?<!\\)\$"), "this $ has no partner: maths is $x$ in one paragraph or $$ … $$ on lines of its own, money \\$5"),
     (re.compile(r"\[\^"), "footnotes are not used: notebooks cannot show them; write a :::{margin} note"),
     (re.compile(r"\(chapter:"), "a link to a chapter is written [text](chapter:43)"),
     (re.compile(r"(BEGIN|END) (SOLUTION|HIDDEN TESTS|MARK SCHEME)"), "nbgrader would take this text for a marker of its own"),
@@ -118,7 +118,7 @@ class Dialect(ABC):
 
 
 class Book(Dialect):
-    """MyST for Jupyter Book. Equations carry the chapter's own numbers; BibTeX keys get a prefix, as each page lists its own works."""
+    """MyST for Jupyter Book. Equations carry the chapter's numbers, BibTeX keys a prefix, as each page lists its own works."""
 
     def directive(self, block: Block, body: str, title: str) -> str:
         names = {"class": "class-container"} if block.kind == "dropdown" else {}  # sphinx-design's own name for it
@@ -233,8 +233,9 @@ def _refuse(text: str, line: int) -> None:
 
 def parse(text: str, line: int = 1) -> list[Block]:
     """Split a text into blocks; a directive's body is left for another call."""
-    lines, blocks, plain = text.split("\n"), [], []
-    at = 0
+    lines, at = text.split("\n"), 0
+    blocks: list[Block] = []
+    plain: list[str] = []
 
     def flush() -> None:
         if plain:
@@ -265,7 +266,9 @@ def _block(lines: list[str], at: int, first: int) -> tuple[Block | None, int]:
     if match := _DIRECTIVE.fullmatch(line):
         return _directive(lines, at, first, match)
     if line.lstrip().startswith(":::"):
-        raise MarkdownError(here, "a ::: that opens or closes nothing (directives begin in the first column, outer ones have more colons)")
+        raise MarkdownError(
+            here, "this ::: opens or closes nothing: directives begin in the first column, outer ones with more colons"
+        )
     if line.lstrip().startswith("$$"):
         return _equation(lines, at, here)
     return None, 1

@@ -1,4 +1,4 @@
-"""What learners get: notebooks, the library with its frozen visible checks, a read-me, and a zip of it all; and nbgrader's course folder.
+"""What learners get: notebooks, the library with its frozen checks, a read-me, a zip of it all. And nbgrader's course folder.
 
 Nothing here holds a solution, a hidden check or the source of any check. The same sources give the same bytes. Every file is
 written whole or not at all, and a notebook that is not as some release wrote it belongs to a learner and is never overwritten.
@@ -50,10 +50,12 @@ def release(
     Raises: ValueError for an unknown chapter; ChapterError for a chapter that breaks its contract.
     """
     chosen = _chosen(only, directory)
-    notebooks = {f"{c.assignment}/{c.assignment}.ipynb": _bytes(assemble.student_view(c, recorded(c), sources(c))) for c in chosen}
+    notebooks = {_name(c): _bytes(assemble.student_view(c, recorded(c), sources(c))) for c in chosen}
     support = {"README.md": _readme(chosen).encode(), **_library(chosen, sources)}
     before = _manifest(out)
-    ours = before["notebooks"] | {name: sorted({*before["notebooks"].get(name, ()), _hash(content)}) for name, content in notebooks.items()}
+    ours = before["notebooks"]
+    for name, content in notebooks.items():
+        ours[name] = sorted({*ours.get(name, ()), _hash(content)})
     # before the notebooks themselves: a release that is interrupted must not take its own file for a learner's later
     _write(out / MANIFEST, json.dumps({"notebooks": ours, "library": sorted(support)}, indent=1).encode())
     for name, content in notebooks.items():
@@ -83,7 +85,7 @@ def write_nbgrader_course(
     """
     for chapter in chapters_.all_chapters(chapters):
         notebook = assemble.nbgrader_view(chapter, recorded(chapter), sources(chapter))
-        _write(directory / "source" / chapter.assignment / f"{chapter.assignment}.ipynb", _bytes(notebook))
+        _write(directory / "source" / _name(chapter), _bytes(notebook))
     _write(directory / "nbgrader_config.py", _NBGRADER_CONFIG.encode())
     return directory
 
@@ -114,7 +116,8 @@ def _pyproject() -> str:
     pins = re.findall(r"^([\w-]+)(?:\[.*\])?==(\S+)", (paths.ROOT / "requirements.txt").read_text(encoding="utf-8"), re.MULTILINE)
     needed = [f"{name}>={version}" for name, version in pins if name in LEARNERS_NEED]
     project = tomllib.loads((paths.ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    return _PYPROJECT.format(version=project["version"], python=project["requires-python"].split(",")[0], dependencies=json.dumps(needed))
+    python = project["requires-python"].split(",")[0]
+    return _PYPROJECT.format(version=project["version"], python=python, dependencies=json.dumps(needed))
 
 
 def _place(path: Path, ours: Iterable[str]) -> Path:
@@ -160,6 +163,10 @@ def _zipped(files: Mapping[str, bytes]) -> bytes:
     return buffer.getvalue()
 
 
+def _name(chapter: Chapter) -> str:
+    return f"{chapter.assignment}/{chapter.assignment}.ipynb"
+
+
 def _bytes(notebook: nbformat.NotebookNode) -> bytes:
     return (nbformat.writes(notebook) + "\n").encode()
 
@@ -169,9 +176,8 @@ def _hash(content: bytes) -> str:
 
 
 def _readme(chosen: list[Chapter]) -> str:
-    rows = "\n".join(f"- `{c.assignment}/{c.assignment}.ipynb`: {c.title} ({c.minutes} minutes). {c.summary}" for c in chosen)
-    example = chosen[0].assignment if chosen else "ch44"
-    return _README.format(rows=rows, example=f"{example}/{example}.ipynb")
+    rows = "\n".join(f"- `{_name(c)}`: {c.title} ({c.minutes} minutes). {c.summary}" for c in chosen)
+    return _README.format(rows=rows, example=_name(chosen[0]) if chosen else "ch44/ch44.ipynb")
 
 
 _README = """\
@@ -188,13 +194,15 @@ In this folder, with Python 3.11 or newer:
     pip install ./course_lib jupyterlab
     jupyter lab {example}
 
-In Google Colab: upload `course.zip` and the notebook, then run `!unzip -oq course.zip && pip install -q ./course_lib` in a first cell.
+In Google Colab: upload `course.zip`, open the notebook, and run this in a first cell:
+
+    !unzip -oq course.zip && pip install -q ./course_lib
 
 ## Work
 
-Each exercise is a function that raises `NotImplementedError`. Replace that line, run the cell, and run the check below it: it says
-what is wrong. You may add cells, imports and functions anywhere. The cells with the checks are locked; the grader uses its own
-anyway, on inputs that you have not seen.
+Each exercise is a function that raises `NotImplementedError`. Replace that line, run the cell, and run the check below it: it
+says what is wrong. You may add cells, imports and functions anywhere. The cells with the checks are locked; the grader uses its
+own anyway, on inputs that you have not seen.
 
 To check a whole notebook at a shell: `python -m course_lib.check {example}`. Hand in the notebook under the name that it has.
 """

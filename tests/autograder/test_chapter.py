@@ -66,5 +66,5 @@ def test_what_the_format_does_not_allow_is_refused_by_file_and_line(tiny, tmp_pa
 def test_two_files_of_one_number_are_refused(tiny, tmp_path):
     for name in ("ch99_a.md", "ch99_b.md"):
         (tmp_path / name).write_bytes(tiny.chapter.path.read_bytes())
-    with pytest.raises(ChapterError, match="ch99_a.md is chapter 99, too"):
+    with pytest.raises(ChapterError, match=r"ch99_a\.md is chapter 99, too"):
         chapter.all_chapters(tmp_path)

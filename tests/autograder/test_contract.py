@@ -40,7 +40,7 @@ def test_the_tiny_chapter_keeps_its_contract(tiny):
         ("exercise: quadruple", "exercise: double", "the id .*double' is taken by line"),
         ("exercise: quadruple", "exercise: eightfold", "the checks of ch99 lack eightfold"),
         ('"open_question": "why_double"', '"open_question": "test_double"', "the id 'test_double' is taken"),
-        ("import check, validate", "import check", "the reference of quadruple uses validate, which no set-up cell above defines"),
+        ("import check, validate", "import check", "the reference of quadruple uses validate, which no set-up"),
         ("from course_lib import check, validate", "from (", "not Python"),
         ("{eq}`third`", "{eq}`fourth`", r"ch99_tiny.md:41: no equation of this chapter is labelled 'fourth'"),
         ("(quadruple)", "(double)", "a second equation is labelled 'double'"),
@@ -61,7 +61,8 @@ def test_names_from_live_cells_do_not_count_as_known_because_the_judge_runs_none
 
 
 def test_set_up_cells_may_hold_magics(tiny, tmp_path):
-    assemble.verify(_broken(tiny, tmp_path, "from course_lib import", "%matplotlib inline\nfrom course_lib import"), tiny.sources(tiny.chapter))
+    magic = _broken(tiny, tmp_path, "from course_lib import", "%matplotlib inline\nfrom course_lib import")
+    assemble.verify(magic, tiny.sources(tiny.chapter))
 
 
 def test_checks_without_a_stub_and_criteria_that_do_not_add_up_are_refused(tiny):

@@ -16,7 +16,13 @@ def _render(text, kind=markdown.Plain):
 @pytest.mark.parametrize("kind", [markdown.Plain, markdown.Book])
 @pytest.mark.parametrize(
     "text",
-    ["Plain *text*.\n\n- a list\n- `{eq}`", "```python\n:::{nothing}\n$\n```", "`` {cite:t}`x` `` and $a_{t}$ and \\$5", "a | b\n--|--\n1 | 50 %", ""],
+    [
+        "",
+        "Plain *text*.\n\n- a list\n- `{eq}`",
+        "```python\n:::{nothing}\n$\n```",
+        "`` {cite:t}`x` `` and $a_{t}$ and \\$5",
+        "a | b\n--|--\n1 | 50 %",
+    ],
 )
 def test_plain_markdown_passes_unchanged(text, kind):
     assert _render(text, kind) == text
@@ -46,7 +52,8 @@ def test_equations_are_numbered_by_chapter_and_referred_to_by_number():
     text = "$$ a = b $$ (one)\n\n:::{math}\n:label: two\n\nc\n:::\n\n{eq}`two` follows {eq}`one`."
     assert _render(text) == "$$\na = b\n\\tag{44.1}\n$$\n\n$$\nc\n\\tag{44.2}\n$$\n\n(44.2) follows (44.1)."
     book = _render(text, markdown.Book)
-    assert "(eq-ch44-two)=\n```{math}\n:nowrap:" in book and book.endswith("[(44.2)](#eq-ch44-two) follows [(44.1)](#eq-ch44-one).")
+    assert "(eq-ch44-two)=\n```{math}\n:nowrap:" in book
+    assert book.endswith("[(44.2)](#eq-ch44-two) follows [(44.1)](#eq-ch44-one).")
 
 
 def test_labels_inside_directives_count_in_reading_order_with_their_lines():

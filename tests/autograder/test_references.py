@@ -8,9 +8,9 @@ REFERENCES = References(Path(__file__).parent / "fixtures" / "references.bib")
 
 
 def test_one_two_and_many_authors_are_named_as_readers_expect():
-    assert REFERENCES.cite(["schulman2016"], parenthesised=False) == "Schulman et al. (2016)"
-    assert REFERENCES.cite(["schulman2016", "sutton2018"], parenthesised=False) == "Schulman et al. (2016) and Sutton and Bärto (2018)"
-    assert REFERENCES.cite(["sutton2018", "schulman2016"], parenthesised=True) == "(Sutton and Bärto, 2018; Schulman et al., 2016)"
+    assert REFERENCES.cite(["schulman2016"], False) == "Schulman et al. (2016)"
+    assert REFERENCES.cite(["schulman2016", "sutton2018"], False) == "Schulman et al. (2016) and Sutton and Bärto (2018)"
+    assert REFERENCES.cite(["sutton2018", "schulman2016"], True) == "(Sutton and Bärto, 2018; Schulman et al., 2016)"
 
 
 def test_the_list_has_each_work_on_one_line_without_escapes_that_nobody_needs():
