@@ -1,16 +1,16 @@
 """One chapter, three renderings: a page for the book, a notebook for learners, a source notebook for nbgrader.
 
-    chapter → executable_view → (the book builder runs it) → book_view, student_view, nbgrader_view
-
-All views are nbformat 4.5 and the same bytes for the same input. Cell ids follow from positions and names, and are the same in all views:
-`ch44-007` for the chapter's own cells, `ch44-test_compute_gae` for the check after a stub. `outputs` is always the executed
-notebook that `executable_view` gave. Errors are ChapterErrors that name file and line.
+All views are nbformat 4.5 and the same bytes for the same input. Cell ids follow from positions and names, and are the same in
+all views: `ch44-007` for the chapter's own cells, `ch44-test_compute_gae` for the check after a stub. `outputs` always has one
+list of outputs for each code cell of the chapter, in order; a stub's are those of its check. Errors are ChapterErrors that name
+file and line.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,15 +22,10 @@ from autograder.chapter import ANSWER_LINE, Cell, Chapter, ChapterError
 from autograder.contract import STUB, Reference, Sources, references
 from autograder.contract import sources as real_sources
 from autograder.references import References
+from course_lib.cases import FACET_TEXT
 
-STUDENT_NOTEBOOK = "downloads/{assignment}.ipynb"  # where a book page links to, relative to the page's own folder
-FACETS = {
-    "values": "the right values",
-    "gradient": "gradient to the right inputs, and to no others",
-    "dtype": "dtype and device of the inputs kept",
-    "inputs": "inputs left unchanged",
-    "errors": "errors that name the argument",
-}
+Outputs = Sequence[list[NotebookNode]]
+
 _LEVELS = {1: "●○○ (1 of 3)", 2: "●●○ (2 of 3)", 3: "●●● (3 of 3)"}
 _ANSI = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 
@@ -58,27 +53,13 @@ def verify(chapter: Chapter, sources: Sources | None = None) -> None:
     """Raise ChapterError unless the chapter keeps its contract: exercises, references and checks agree, and all views render."""
     sources = sources or real_sources(chapter)
     student_view(chapter, sources=sources)
-    book_view(chapter, executable_view(chapter, sources), sources=sources)
+    book_view(chapter, [[] for cell in chapter.cells if cell.kind == "code"], sources=sources)
 
 
-def executable_view(chapter: Chapter, sources: Sources | None = None) -> NotebookNode:
-    """The notebook that the book builder runs: all code cells, each stub replaced by an import of the reference."""
-    sources = sources or real_sources(chapter)
-    references(chapter, sources)
-    cells = []
-    for key, cell in _keyed(chapter):
-        if cell.exercise:
-            cells.append(_code(key, f"from {sources.solutions.__name__} import {cell.exercise}"))
-            cells.append(_code(_test_key(chapter, cell), f"check({cell.exercise})"))
-        elif cell.kind == "code":
-            cells.append(_code(key, cell.source, cell.tags))
-    return _notebook(cells)
-
-
-def book_view(chapter: Chapter, outputs: NotebookNode, with_solutions: bool = True, sources: Sources | None = None) -> NotebookNode:
+def book_view(chapter: Chapter, outputs: Outputs, with_solutions: bool = True, sources: Sources | None = None) -> NotebookNode:
     """The page as MyST for Jupyter Book (`execute_notebooks: "off"`): stubs, executed outputs, folded references.
 
-    The page links to `STUDENT_NOTEBOOK`, which must lie there when Sphinx runs. Nothing of a reference is in it if not with_solutions.
+    Nothing of a reference is in it if not with_solutions. Pages of one book must lie in one folder, as CHAPTER.page + ".ipynb".
     """
     sources = sources or real_sources(chapter)
     solutions = references(chapter, sources)
@@ -86,12 +67,12 @@ def book_view(chapter: Chapter, outputs: NotebookNode, with_solutions: bool = Tr
 
     def stub(key: str, cell: Cell) -> Iterator[NotebookNode]:
         yield _code(key, cell.source)
-        yield _code(_test_key(chapter, cell), f"check({cell.exercise})", outputs=executed(_test_key(chapter, cell)))
+        yield _code(_test_key(chapter, cell), f"check({cell.exercise})", outputs=executed[key])
         if with_solutions:
             yield _markdown(f"{key}-reference", _folded(solutions[str(cell.exercise)]))
 
     def code(key: str, cell: Cell) -> NotebookNode:
-        node = _code(key, cell.source, cell.tags - {"live", "book-only"}, executed(key))
+        node = _code(key, cell.source, cell.tags - {"live", "book-only"}, executed[key])
         if cell.alt:
             node.metadata["mystnb"] = {"image": {"alt": cell.alt}}
         return node
@@ -100,15 +81,10 @@ def book_view(chapter: Chapter, outputs: NotebookNode, with_solutions: bool = Tr
         return _markdown(key, text.removesuffix(ANSWER_LINE).rstrip())
 
     dialect = _dialect(markdown.Book, chapter, sources)
-    link = STUDENT_NOTEBOOK.format(assignment=chapter.assignment)
-    download = f"\n- **Notebook:** {{download}}`{chapter.assignment}.ipynb <{link}>`"
-    page = _notebook(_page(chapter, sources, dialect, download, stub, code, question))
-    if widgets := outputs.metadata.get("widgets"):
-        page.metadata["widgets"] = widgets
-    return page
+    return _notebook(_page(chapter, sources, dialect, stub, code, question))
 
 
-def student_view(chapter: Chapter, outputs: NotebookNode | None = None, sources: Sources | None = None) -> NotebookNode:
+def student_view(chapter: Chapter, outputs: Outputs | None = None, sources: Sources | None = None) -> NotebookNode:
     """The learner's notebook: plain Markdown, stubs, locked checks; what only the book can run, as recorded output.
 
     Without `outputs` such cells become a sentence that says where to see the result.
@@ -116,7 +92,7 @@ def student_view(chapter: Chapter, outputs: NotebookNode | None = None, sources:
     return _learner_view(chapter, outputs, sources, teacher=False)
 
 
-def nbgrader_view(chapter: Chapter, outputs: NotebookNode | None = None, sources: Sources | None = None) -> NotebookNode:
+def nbgrader_view(chapter: Chapter, outputs: Outputs | None = None, sources: Sources | None = None) -> NotebookNode:
     """nbgrader's source notebook: the student view with solution regions and hidden tests.
 
     What `nbgrader generate_assignment` makes of it, under release.write_nbgrader_course's configuration, is the student view.
@@ -124,10 +100,10 @@ def nbgrader_view(chapter: Chapter, outputs: NotebookNode | None = None, sources
     return _learner_view(chapter, outputs, sources, teacher=True)
 
 
-def _learner_view(chapter: Chapter, outputs: NotebookNode | None, sources: Sources | None, teacher: bool) -> NotebookNode:
+def _learner_view(chapter: Chapter, outputs: Outputs | None, sources: Sources | None, teacher: bool) -> NotebookNode:
     sources = sources or real_sources(chapter)
     solutions = references(chapter, sources)
-    executed = _outputs(chapter, outputs) if outputs else None
+    executed = _outputs(chapter, outputs) if outputs is not None else {}
 
     def stub(key: str, cell: Cell) -> Iterator[NotebookNode]:
         name = str(cell.exercise)
@@ -142,7 +118,7 @@ def _learner_view(chapter: Chapter, outputs: NotebookNode | None, sources: Sourc
 
     def code(key: str, cell: Cell) -> NotebookNode:
         if "book-only" in cell.tags:
-            return _recorded(key, cell, executed(key) if executed else None, chapter)
+            return _recorded(key, cell, executed.get(key, []), chapter)
         node = _code(key, cell.source, cell.tags)
         if cell.tags & {"hide-input", "hide-cell"}:
             node.metadata["jupyter"] = {"source_hidden": True}
@@ -154,20 +130,19 @@ def _learner_view(chapter: Chapter, outputs: NotebookNode | None, sources: Sourc
         return _graded(_markdown(key, text), str(cell.open_question), solution=True, points=cell.points)
 
     dialect = _dialect(markdown.Plain, chapter, sources)
-    return _notebook(_page(chapter, sources, dialect, "", stub, code, question))
+    return _notebook(_page(chapter, sources, dialect, stub, code, question))
 
 
 def _page(
     chapter: Chapter,
     sources: Sources,
     dialect: markdown.Dialect,
-    extra: str,
     stub: Callable[[str, Cell], Iterable[NotebookNode]],
     code: Callable[[str, Cell], NotebookNode],
     question: Callable[[str, Cell, str], NotebookNode],
 ) -> Iterator[NotebookNode]:
     """The cells of a page in order: what the views share, with their own ways to write stubs, code and questions."""
-    yield _markdown(f"{chapter.assignment}-front", _render(_front(chapter, sources), dialect, chapter, 1) + extra)
+    yield _markdown(f"{chapter.assignment}-front", _render(_front(chapter, sources), dialect, chapter, 1))
     level, number = 2, 0
     for key, cell in _keyed(chapter):
         if cell.exercise:
@@ -206,7 +181,7 @@ def _front(chapter: Chapter, sources: Sources) -> str:
 
 def _heading(cell: Cell, level: int, number: str, sources: Sources) -> str:
     exercise = sources.exercise(str(cell.exercise))
-    rows = "\n".join(f"| {FACETS.get(name, name)} | {points:g} |" for name, points in exercise.criteria.items())
+    rows = "\n".join(f"| {FACET_TEXT[name]} | {points:g} |" for name, points in exercise.criteria.items())
     return (
         f"{'#' * level} Exercise {number}: `{cell.exercise}`\n\n"
         f"Difficulty {_LEVELS[cell.difficulty]} · {_duration(cell.minutes)} · {_points(exercise.points)}\n\n"
@@ -219,10 +194,11 @@ def _folded(reference: Reference) -> str:
     return f"::::{{dropdown}} Reference solution\n````python\n{reference.signature}\n{reference.body}\n````\n::::"
 
 
-def _recorded(key: str, cell: Cell, outputs: list[NotebookNode] | None, chapter: Chapter) -> NotebookNode:
+def _recorded(key: str, cell: Cell, outputs: list[NotebookNode], chapter: Chapter) -> NotebookNode:
     """What a book-only cell has shown in the book, as a markdown cell: pictures as attachments, text in a fence."""
-    parts, attachments = [], {}
-    for output in outputs or []:
+    parts: list[str] = []
+    attachments: dict[str, dict[str, str]] = {}
+    for output in outputs:
         data = output.get("data", {})
         if "image/png" in data:
             name = f"{key}-{len(attachments) + 1}.png"
@@ -243,7 +219,9 @@ def _dialect(kind: type[markdown.Dialect], chapter: Chapter, sources: Sources) -
     equations: dict[str, str] = {}
     for cell in chapter.cells:
         if cell.kind == "markdown":
-            for label, line in _located(chapter, cell.line, lambda cell=cell: list(markdown.labels(cell.source, cell.line))):
+            with _located(chapter):
+                found = list(markdown.labels(cell.source, cell.line))
+            for label, line in found:
                 if label in equations:
                     raise ChapterError(chapter.path, line, f"a second equation is labelled {label!r}")
                 equations[label] = f"{chapter.number}.{len(equations) + 1}"
@@ -251,26 +229,25 @@ def _dialect(kind: type[markdown.Dialect], chapter: Chapter, sources: Sources) -
 
 
 def _render(text: str, dialect: markdown.Dialect, chapter: Chapter, line: int) -> str:
-    return _located(chapter, line, lambda: markdown.render(text, dialect, line))
+    with _located(chapter):
+        return markdown.render(text, dialect, line)
 
 
-def _located(chapter: Chapter, line: int, call: Callable[[], Any]) -> Any:
+@contextmanager
+def _located(chapter: Chapter) -> Iterator[None]:
+    """Adds the file's name to the errors of its Markdown."""
     try:
-        return call()
+        yield
     except markdown.MarkdownError as error:
         raise ChapterError(chapter.path, error.line, str(error)) from error
 
 
-def _outputs(chapter: Chapter, executed: NotebookNode) -> Callable[[str], list[NotebookNode]]:
-    """Looks up a cell's outputs by the cell's id."""
-    known = {cell.id: cell.outputs for cell in executed.cells if cell.cell_type == "code"}
-
-    def find(key: str) -> list[NotebookNode]:
-        if key not in known:
-            raise ChapterError(chapter.path, 1, f"the executed notebook has no cell {key}: it belongs to another version of the chapter")
-        return known[key]
-
-    return find
+def _outputs(chapter: Chapter, outputs: Outputs) -> dict[str, list[NotebookNode]]:
+    """The outputs of each code cell, by the cell's id."""
+    keys = [key for key, cell in _keyed(chapter) if cell.kind == "code"]
+    if len(keys) != len(outputs):
+        raise ChapterError(chapter.path, 1, f"there are outputs of {len(outputs)} code cells, but {len(keys)} code cells")
+    return dict(zip(keys, outputs, strict=True))
 
 
 def _keyed(chapter: Chapter) -> Iterator[tuple[str, Cell]]:

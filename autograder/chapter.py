@@ -123,7 +123,8 @@ def parse(path: Path) -> Chapter:
     if not path.name.startswith(f"ch{front['chapter']}_"):
         raise ChapterError(path, 1, f"chapter {front['chapter']} must lie in a file called ch{front['chapter']}_*.md")
     lines = text.splitlines()
-    cells = tuple(_cell(path, cell, start, lines) for cell, start in zip(notebook.cells, notebook.metadata.source_map, strict=True))
+    located = zip(notebook.cells, notebook.metadata.source_map, strict=True)
+    cells = tuple(_cell(path, cell, start, lines) for cell, start in located)
     return Chapter(
         front["chapter"],
         path,
@@ -172,7 +173,9 @@ def _stub_options(path: Path, line: int, tags: frozenset[str], options: dict[str
         raise ChapterError(path, line, "an exercise needs difficulty: 1, 2 or 3, and minutes: at least 1")
 
 
-def _expect(path: Path, line: int, where: str, found: dict[str, Any], types: dict[str, Any], required: set[str] | None = None) -> None:
+def _expect(
+    path: Path, line: int, where: str, found: dict[str, Any], types: dict[str, Any], required: set[str] | None = None
+) -> None:
     """Refuse missing and unknown keys, and values of another type."""
     if unknown := found.keys() - types.keys():
         raise ChapterError(path, line, f"unknown option {sorted(unknown)[0]!r} in a {where}; known: {', '.join(types)}")

@@ -129,11 +129,11 @@ def _one_of_each(chapter: Chapter, sources: Sources) -> None:
         raise ChapterError(chapter.path, 1, f"no stub for {', '.join(sorted(stubless))}, which the checks name")
     for exercise in sources.exercises:
         if abs(sum(exercise.criteria.values()) - exercise.points) > 1e-9:
-            raise ChapterError(chapter.path, 1, f"the criteria of {exercise.name} do not add up to its {exercise.points:g} points")
+            raise ChapterError(chapter.path, 1, f"the criteria of {exercise.name} do not add up to {exercise.points:g} points")
 
 
 def _names_are_known(chapter: Chapter, found: Mapping[str, Reference]) -> None:
-    """Every global name that a reference uses is defined in the notebook above it: by set-up cells (which the judge runs, too) or stubs."""
+    """Every global name that a reference uses is defined above it: by stubs, or by set-up cells, which the judge runs, too."""
     known = set(dir(builtins))
     for cell in chapter.cells:
         if cell.exercise:
@@ -171,4 +171,4 @@ def _defined(chapter: Chapter, cell: Cell) -> set[str]:
         top = symtable.symtable(source, "cell", "exec")
     except SyntaxError as error:
         raise ChapterError(chapter.path, cell.line + int(error.lineno or 0), f"not Python: {error.msg}") from error
-    return {symbol.get_name() for symbol in top.get_symbols() if symbol.is_assigned() or symbol.is_imported() or symbol.is_namespace()}
+    return {name.get_name() for name in top.get_symbols() if name.is_assigned() or name.is_imported() or name.is_namespace()}

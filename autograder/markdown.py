@@ -26,13 +26,14 @@ _MATH = re.compile(r"(?P<indent>[ \t]*)\$\$(?P<body>.*?)\$\$[ \t]*(?:\((?P<label
 _INLINE = re.compile(
     r"\{(?P<role>[A-Za-z][\w:+-]*)\}`(?P<content>[^`]+)`"
     r"|(?P<ticks>`+)(?!`).+?(?<!`)(?P=ticks)(?!`)"
-    r"|(?<![\\$])(?P<dollars>\$\$?)(?![\s$])(?:\\.|[^$\\\n]|\n(?!\s*\n))+?(?<!\s)(?P=dollars)(?!\d)"
+    r"|(?<![\\$])\$(?!\$)(?:\\.|[^$\\\n]|\n(?!\s*\n))+?\$"
     r"|\[(?P<text>[^\]]*)\]\(chapter:(?P<chapter>\d+)\)",
     re.DOTALL,
 )
 _REFUSED = [
     (re.compile(r"^\([\w:-]+\)=\s*$", re.MULTILINE), "targets `(label)=` are not used: notebooks cannot show them"),
     (re.compile(r"^%", re.MULTILINE), "MyST comments are not used: notebooks would print them"),
+    (re.compile(r"(?<!\\)\$"), "this $ has no partner: maths is $x$ in one paragraph or $$ … $$ on lines of its own, money \\$5"),
     (re.compile(r"\[\^"), "footnotes are not used: notebooks cannot show them; write a :::{margin} note"),
     (re.compile(r"\(chapter:"), "a link to a chapter is written [text](chapter:43)"),
     (re.compile(r"(BEGIN|END) (SOLUTION|HIDDEN TESTS|MARK SCHEME)"), "nbgrader would take this text for a marker of its own"),
@@ -117,10 +118,11 @@ class Dialect(ABC):
 
 
 class Book(Dialect):
-    """MyST for Jupyter Book. Equations carry the chapter's own numbers; BibTeX keys get a prefix, as each page lists its own works."""
+    """MyST for Jupyter Book. Equations carry the chapter's numbers, BibTeX keys a prefix, as each page lists its own works."""
 
     def directive(self, block: Block, body: str, title: str) -> str:
-        options = "".join(f":{key}: {value}".rstrip() + "\n" for key, value in block.options.items())
+        names = {"class": "class-container"} if block.kind == "dropdown" else {}  # sphinx-design's own name for it
+        options = "".join(f":{names.get(key, key)}: {value}".rstrip() + "\n" for key, value in block.options.items())
         return f"{block.fence}{{{block.kind}}} {title}".rstrip() + f"\n{options}\n{body}\n{block.fence}"
 
     def math(self, block: Block) -> str:
@@ -231,8 +233,9 @@ def _refuse(text: str, line: int) -> None:
 
 def parse(text: str, line: int = 1) -> list[Block]:
     """Split a text into blocks; a directive's body is left for another call."""
-    lines, blocks, plain = text.split("\n"), [], []
-    at = 0
+    lines, at = text.split("\n"), 0
+    blocks: list[Block] = []
+    plain: list[str] = []
 
     def flush() -> None:
         if plain:
@@ -263,7 +266,9 @@ def _block(lines: list[str], at: int, first: int) -> tuple[Block | None, int]:
     if match := _DIRECTIVE.fullmatch(line):
         return _directive(lines, at, first, match)
     if line.lstrip().startswith(":::"):
-        raise MarkdownError(here, "a ::: that opens or closes nothing (directives begin in the first column, outer ones have more colons)")
+        raise MarkdownError(
+            here, "this ::: opens or closes nothing: directives begin in the first column, outer ones with more colons"
+        )
     if line.lstrip().startswith("$$"):
         return _equation(lines, at, here)
     return None, 1
@@ -286,16 +291,14 @@ def _directive(lines: list[str], at: int, first: int, match: re.Match[str]) -> t
     return Block(name, text, here, first + body, match["fence"], match["argument"], options), end + 1 - at
 
 
-def _equation(lines: list[str], at: int, here: int) -> tuple[Block | None, int]:
+def _equation(lines: list[str], at: int, here: int) -> tuple[Block, int]:
     for end in range(at, len(lines)):
         if end > at and not lines[end].strip():
             break
         text = "\n".join(lines[at : end + 1])
         if match := _MATH.fullmatch(text):
             return _math_block(match["body"], here, match["label"], match["indent"]), end + 1 - at
-        if end == at and text.count("$$") > 1:
-            return None, 1  # a paragraph that begins with a displayed equation
-    raise MarkdownError(here, "this $$ is not closed before the paragraph ends")
+    raise MarkdownError(here, "this $$ is not closed, on a line's end, before the paragraph ends")
 
 
 def _math_block(text: str, line: int, label: str | None, indent: str) -> Block:

@@ -8,11 +8,14 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import torch
 from nbformat.v4 import new_output
 
-from autograder import assemble, chapter, contract
+from autograder import chapter, contract
+from autograder.spec import Case, Exercise
 
 FIXTURES = Path(__file__).parent / "fixtures"
+PIXEL = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
 
 
 def _solutions():
@@ -23,15 +26,20 @@ def _solutions():
     return module
 
 
+def _exercise(name, reference, criteria):
+    case = Case("a number", lambda generator: {"x": torch.rand((), generator=generator, dtype=torch.float64)}, visible=True)
+    return Exercise(name, reference, criteria, cases=(case,), misconceptions=(), variants={})
+
+
 @pytest.fixture(scope="session")
 def tiny():
-    """The parsed chapters, `sources(chapter)`, and a notebook as the book builder would have executed it."""
+    """The parsed chapters, `sources(chapter)`, and the outputs of chapter 99 as the book builder would have recorded them."""
     solutions = _solutions()
     exercises = {
         98: (),
         99: (
-            SimpleNamespace(name="double", points=1.0, criteria={"values": 1.0}),
-            SimpleNamespace(name="quadruple", points=3.0, criteria={"values": 2.5, "errors": 0.5}),
+            _exercise("double", solutions.double, {"values": 1.0}),
+            _exercise("quadruple", solutions.quadruple, {"values": 2.5, "errors": 0.5}),
         ),
     }
 
@@ -39,15 +47,15 @@ def tiny():
         pages = {98: "ch98_before", 99: "ch99_tiny"}
         return contract.Sources(exercises[chapter.number], solutions, FIXTURES / "references.bib", pages)
 
-    course = SimpleNamespace(directory=FIXTURES / "chapters", sources=sources)
+    picture = {"image/png": PIXEL, "text/plain": "<Figure size 640x480 with 1 Axes>"}
+    outputs = [
+        [],
+        [new_output("stream", text="double: all checks pass\n")],
+        [new_output("stream", text="quadruple: all checks pass\n")],
+        [new_output("stream", text="2.0\n")],
+        [new_output("stream", text="\x1b[1mrecorded\x1b[0m\n"), new_output("display_data", picture)],
+    ]
+    course = SimpleNamespace(directory=FIXTURES / "chapters", sources=sources, outputs=outputs)
     course.before = chapter.load(98, course.directory)
     course.chapter = chapter.load(99, course.directory)
-    course.executed = assemble.executable_view(course.chapter, sources(course.chapter))
-    outputs = {"check(double)": "double: all checks pass", "print(quadruple(0.5))": "2.0"}
-    for cell in course.executed.cells:
-        if cell.source in outputs:
-            cell.outputs = [new_output("stream", name="stdout", text=outputs[cell.source] + "\n")]
-        if cell.source == 'print("recorded")':
-            data = {"image/png": "iVBORw0KGgo=", "text/plain": "<Figure size 640x480 with 1 Axes>"}
-            cell.outputs = [new_output("stream", text="\x1b[1mrecorded\x1b[0m\n"), new_output("display_data", data)]
     return course
