@@ -2,8 +2,8 @@
 
 nbgrader's own tables and models (0.9.6) are used as they are; only the transactions are ours. Its API commits after every row, so
 that a kill leaves half a submission; here each submission is one transaction, and so is the creation of the database. What
-teachers type (manual scores, extra credit, comments, names, due dates) is never written. SQLite runs with a write-ahead log, in which
-readers such as formgrader never block the writer; the log needs a local disk. Other databases work by their SQLAlchemy URL.
+teachers type (manual scores, extra credit, comments, names, due dates) is never written. SQLite runs with a write-ahead log, in
+which readers such as formgrader never block the writer; the log needs a local disk. Other databases work by their SQLAlchemy URL.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from nbgrader.api import (
 )
 from nbgrader.dbutil import ALEMBIC_DIR
 from sqlalchemy import URL, and_, create_engine, delete, event, func, inspect, make_url, select, text, true
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, aliased
 
 from autograder.verdicts import Item, Verdict, plain_name, write_atomically
 
@@ -254,10 +254,11 @@ class GradebookWriter:
 
         The score is None as long as an answered question waits for its first score, or no question has one.
         """
-        question = and_(SolutionCell.name == GradeCell.name, SolutionCell.notebook_id == GradeCell.notebook_id)
+        solution = aliased(SolutionCell, flat=True)
+        question = and_(solution.name == GradeCell.name, solution.notebook_id == GradeCell.notebook_id)
         with self._transaction() as db:
             cells = db.scalars(
-                select(GradeCell).join(SolutionCell, question).join(Notebook, Notebook.id == GradeCell.notebook_id)
+                select(GradeCell).join(solution, question).join(Notebook, Notebook.id == GradeCell.notebook_id)
                 .join(Assignment).where(Assignment.name == assignment)
             ).all()  # fmt: skip
             grades = db.scalars(
@@ -363,9 +364,9 @@ def write_autograded(
     if verdict.status not in ("graded", "student_error"):
         return None
     originals = graded_cells(release)
-    safe_sources = {cell.source for cell in release.cells}
+    untouched = {cell.source: cell for cell in release.cells}
     items = {f"test_{item.exercise}": item for item in verdict.automatic}
-    cells = [_harmless(cell, safe_sources) for cell in _in_order(release, submitted or release)]
+    cells = [_harmless(cell, untouched) for cell in _in_order(release, submitted or release)]
     for number, cell in enumerate(cells):
         cell.id = f"cell-{number}"
         name = cell.metadata.get("nbgrader", {}).get("grade_id")
@@ -403,15 +404,17 @@ def _passive(markdown: str) -> str:
     return _ACTIVE.sub(lambda match: match[0] + " ", markdown).encode(errors="replace").decode()
 
 
-def _harmless(cell: NotebookNode, safe_sources: set[str]) -> NotebookNode:
+def _harmless(cell: NotebookNode, untouched: Mapping[str, NotebookNode]) -> NotebookNode:
     """A fresh cell with the same text. A teacher reads it in a page that may change grades, so nothing in it may be active."""
     metadata = NotebookNode(cell.metadata)
+    original: Mapping[str, Any] = untouched.get(cell.source, {})
     if cell.cell_type == "code":
         outputs = [kept for output in cell.get("outputs", []) if (kept := _harmless_output(output))]
         return new_code_cell(cell.source, outputs=outputs, metadata=metadata)
-    source = cell.source if cell.source in safe_sources else _passive(cell.source)
+    source = cell.source if original else _passive(cell.source)
     if cell.cell_type == "markdown":
-        return new_markdown_cell(source, metadata=metadata)
+        pictures = {"attachments": original["attachments"]} if "attachments" in original else {}
+        return new_markdown_cell(source, metadata=metadata, **pictures)
     return new_raw_cell(source, metadata=metadata)
 
 

@@ -76,9 +76,7 @@ class Item:
     @classmethod
     def of(cls, value: Item | Mapping[str, Any]) -> Item:
         """A valid, cleaned item. Raises: ValueError, TypeError for missing or unknown keys."""
-        if isinstance(value, Item):
-            return value
-        item = cls(**value)
+        item = value if isinstance(value, Item) else cls(**value)
         if item.state not in STATES:
             raise ValueError(f"{item.exercise}: unknown state {item.state!r}, expected one of {STATES}")
         score, max_score = _points("score", item.score), _points("max_score", item.max_score)
@@ -111,9 +109,7 @@ class Verdict:
 
         Raises: ValueError for impossible values, TypeError for missing or unknown keys.
         """
-        if isinstance(value, Verdict):
-            return value
-        raw = cls(**value)
+        raw = value if isinstance(value, Verdict) else cls(**value)
         if raw.schema != SCHEMA:
             raise ValueError(f"verdict schema {raw.schema!r} is not {SCHEMA}")
         if raw.status not in STATUSES:
