@@ -57,13 +57,15 @@ def countable(grades: Iterable[Mapping[str, Any]], verdicts: Iterable[Verdict]) 
 # --- tables ------------------------------------------------------------------------------------------------------------------
 
 
+_FORMULA = tuple("=+-@＝＋－＠")  # some spreadsheets take the full-width characters, too
+
+
 def _cell(value: Any) -> Any:
-    """A CSV cell that no spreadsheet takes for a formula; numbers stay numbers."""
-    if value is None:
-        return ""
-    if isinstance(value, str) and value.lstrip(" \n").startswith(("=", "+", "-", "@", "\t", "\r", "＝", "＋", "－", "＠")):
-        return "'" + value
-    return value
+    """A CSV cell that no spreadsheet takes for a formula, nor a carriage return for a new row; numbers stay numbers."""
+    if not isinstance(value, str):
+        return "" if value is None else value
+    text = clean_text(value)
+    return "'" + text if text.startswith("\t") or text.lstrip()[:1] in _FORMULA else text
 
 
 def _csv(header: Sequence[str], rows: Iterable[Iterable[Any]]) -> str:
