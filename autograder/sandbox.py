@@ -296,14 +296,16 @@ class Sandbox:
         if self._process is not None:
             tree = self._tree()
             # The kernel ends a whole namespace with its process 1, and bwrap, whose child that is, reaps it and exits.
-            for process in tree[:1] if not self.trusted else tree:
+            for process in tree if self.trusted else tree[:1]:
                 with suppress(psutil.NoSuchProcess):
                     process.kill()
-            with suppress(subprocess.TimeoutExpired):
-                self._process.wait(timeout=2 if tree and not self.trusted else 0)
+            if tree and not self.trusted:
+                with suppress(subprocess.TimeoutExpired):
+                    self._process.wait(timeout=2)
             self._process.kill()
             self._process.wait()
-            psutil.wait_procs(tree[:1], timeout=5)
+            if not self.trusted:
+                psutil.wait_procs(tree[:1], timeout=5)
             self._process = None
         if self._socket is not None:
             self._socket.close()
