@@ -1,7 +1,7 @@
 """The system calls that a learner's process never needs, as a compiled seccomp filter for `bwrap --seccomp`.
 
 `program() -> bytes` is classic BPF (linux/seccomp.h): another architecture's calls kill the process, the calls listed
-below answer EPERM, all others pass. OSError on a machine whose call numbers are not in the table.
+below answer EPERM, all others pass. NotImplementedError on a machine whose call numbers are not in the table.
 """
 
 import errno
@@ -35,7 +35,7 @@ X32 = 0x40000000  # the x32 ABI on x86_64: the same calls under numbers with thi
 def program() -> bytes:
     machine = platform.machine()
     if machine not in AUDIT_ARCH:
-        raise OSError(f"no system-call filter for a {machine} machine: the sandbox knows {', '.join(AUDIT_ARCH)}")
+        raise NotImplementedError(f"no system-call filter for a {machine} machine: the sandbox knows {', '.join(AUDIT_ARCH)}")
     numbers = [pair[list(AUDIT_ARCH).index(machine)] for pair in DENIED.values()]
     tests = [(JUMP_GREATER_EQUAL, X32), *((JUMP_EQUAL, number) for number in numbers)]
     code = [(LOAD, 0, 0, ARCHITECTURE), (JUMP_EQUAL, 1, 0, AUDIT_ARCH[machine]), (RETURN, 0, 0, KILL), (LOAD, 0, 0, NUMBER)]
