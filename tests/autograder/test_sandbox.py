@@ -129,9 +129,9 @@ def test_the_learners_packages_import_and_work_within_the_limits(ask):
 
 def test_starting_costs_little_beside_the_interpreter(enter):
     with enter("say(1)"):
-        pass  # the mount list is computed once
+        pass  # the mount list is made once in a process: that takes 0.5 s
     best = min(_seconds_to_start(enter) for _ in range(3))
-    assert best < 0.3  # 0.08 s on an idle machine
+    assert best < 0.5  # 0.1 s on an idle machine
 
 
 def _seconds_to_start(enter):
@@ -241,7 +241,8 @@ def test_solutions_autograder_and_nbgrader_cannot_be_imported(ask):
     code = """
         import importlib
         names = ["solutions", "solutions.ch44", "autograder", "autograder.sandbox", "nbgrader", "course_lib", "pytest", "dask"]
-        sys.path += ["/python/lib/python3.11/site-packages", "/python/lib/python3.11/dist-packages"]
+        sys.path += ["/python/lib/python3.11/site-packages", "/python/lib/python3.11/dist-packages",
+                     "/usr/lib/python3/dist-packages", "/usr/local/lib/python3.11/dist-packages"]
         say({name: outcome(importlib.import_module, name) for name in names})
     """
     assert set(ask(code).values()) == {"ModuleNotFoundError"}
@@ -476,6 +477,19 @@ def test_a_million_empty_files_are_noticed(enter):
         box.receive(10)
 
 
+def test_full_sockets_are_noticed(enter):
+    code = """
+        kept = []
+        for _ in range(100):
+            kept += socket.socketpair()
+            kept[-1].setblocking(False)
+            outcome(lambda: [kept[-1].send(bytes(30000)) for _ in range(100)])
+        time.sleep(100)
+    """
+    with enter(code) as box, pytest.raises(SandboxDied, match="sockets"):
+        box.receive(10)
+
+
 def test_everything_inside_is_first_in_line_for_the_oom_killer(ask):
     code = """
         reader, writer = os.pipe()
@@ -690,6 +704,27 @@ def test_odd_names_are_only_names(ask, tmp_path):
     assert sorted(ask("say(sorted(os.listdir()))", files=dict.fromkeys(names, tmp_path / "given"))) == sorted(names)
 
 
+def test_more_files_than_fit_are_refused(enter, tmp_path):
+    with open(tmp_path / "given", "wb") as file:
+        file.truncate(sandbox.MAX_FILES_SIZE + 1)
+    with pytest.raises(ValueError, match="256 MiB"), enter("say(1)", files={"given": tmp_path / "given"}):
+        pass
+    with pytest.raises(ValueError, match="at most"):
+        enter("say(1)", files={str(number): tmp_path / "given" for number in range(sandbox.MAX_FILES + 1)})
+
+
+def test_a_missing_package_is_ours_not_the_learners(enter, monkeypatch):
+    monkeypatch.setattr(bubblewrap, "LEARNER_PACKAGES", ("numpy", "no-such-package"))
+    for cached in (bubblewrap.packages, bubblewrap._host_mounts):
+        cached.cache_clear()
+    try:
+        with pytest.raises(SandboxUnavailable, match="no-such-package not installed"), enter("say(1)"):
+            pass
+    finally:
+        for cached in (bubblewrap.packages, bubblewrap._host_mounts):
+            cached.cache_clear()
+
+
 def test_a_large_file_handed_in_does_not_use_up_the_learners_space(ask, tmp_path):
     (tmp_path / "weights").write_bytes(bytes(20 * MiB))
     code = f"""
@@ -730,15 +765,15 @@ def test_a_failing_bubblewrap_is_ours_and_explained(enter, monkeypatch, tmp_path
     fake.write_text(f'#!/bin/sh\necho "{complaint}" >&2\nexit 1\n')
     fake.chmod(0o755)
     monkeypatch.setenv("PATH", f"{fake.parent}:{os.environ['PATH']}")
-    monkeypatch.setattr(sandbox, "_kernel", lambda name: "")
+    monkeypatch.setattr(bubblewrap, "_kernel", lambda name: "")
     with pytest.raises(SandboxUnavailable, match=advice) as caught, enter("say(1)"):
         pass
     assert complaint in str(caught.value)
 
 
 def test_apparmor_is_named_where_it_is_to_blame(monkeypatch):
-    monkeypatch.setattr(sandbox, "_kernel", lambda name: "1" if "apparmor" in name else "")
-    assert "sysctl kernel.apparmor_restrict_unprivileged_userns=0" in sandbox._explain(
+    monkeypatch.setattr(bubblewrap, "_kernel", lambda name: "1" if "apparmor" in name else "")
+    assert "sysctl kernel.apparmor_restrict_unprivileged_userns=0" in bubblewrap.explain(
         "bwrap: setting up uid map: Permission denied"
     )
 
