@@ -23,6 +23,7 @@ from autograder import bubblewrap, sandbox
 from autograder.sandbox import Limits, MiB, Sandbox, SandboxDied, SandboxGarbage, SandboxTimeout, SandboxUnavailable
 
 ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = str(Path(pytest.__file__).parents[1])  # where this machine has installed them
 
 PRELUDE = """
 import ctypes, errno, json, os, signal, socket, sys, threading, time
@@ -183,7 +184,7 @@ def test_trusted_runs_the_same_script_without_bubblewrap(enter, tmp_path):
 def test_no_file_of_the_host_is_visible(ask):
     code = f"""
         paths = ["/etc/passwd", "/etc/shadow", "/etc/hostname", "/root", "/home", "/var", "/run", "/sys", "/opt", "/mnt",
-                 "/usr/bin", "/usr/local", "/tools", "/oldroot", "/newroot", {str(ROOT)!r}, {str(Path.home())!r}, {sys.prefix!r}]
+                 "/usr/bin", "/usr/local", "/tools", "/oldroot", "/newroot", {str(ROOT)!r}, {str(Path.home())!r}, {PACKAGES!r}]
         found = [path for path in paths if os.path.exists(path)]
         bases = ("/work", "/proc/self/cwd", "/proc/1/root", "/proc/1/cwd")
         up = [os.path.exists(f"{{base}}/../../../../{str(ROOT)[1:]}") for base in bases]
@@ -210,7 +211,7 @@ def test_no_environment_and_no_arguments_of_the_grader_are_visible(ask, monkeypa
     text, environment = ask(code)
     everything = json.dumps([text, environment])
     assert "hunter2" not in everything and "GRADER_SECRET" not in everything
-    assert str(ROOT) not in everything and sys.prefix not in everything
+    assert str(ROOT) not in everything and PACKAGES not in everything
     assert text["1/environ"] in ("", "PWD=/\0")
     assert set(environment) <= {*bubblewrap.ENVIRONMENT, "LD_LIBRARY_PATH", "PWD", "LC_CTYPE"}
 
