@@ -18,6 +18,7 @@ from packaging.requirements import Requirement
 
 MiB = 1 << 20
 NOBODY = "65534"
+APART = ("--unshare-net", "--unshare-ipc", "--unshare-uts", "--hostname", "sandbox")
 LIBRARY_CACHE = ("--ro-bind-try", "/etc/ld.so.cache", "/etc/ld.so.cache")
 
 # What a learner may import, beside course_lib. Their requirements come with them; nothing else that is installed does.
@@ -142,7 +143,7 @@ def layers(course: Sequence[Path], files: Mapping[str, int], limits: Limits, fil
         mounts += ["--ro-bind", str(path.resolve()), f"/course/{path.name}"]
     sealed = [*_sealed(limits, files), "--seccomp", filter_fd]
     if os.geteuid() != 0:
-        return [([_tool("bwrap")], ["--unshare-net", "--unshare-ipc", "--unshare-uts", *mounts, *sealed])]
+        return [([_tool("bwrap")], [*APART, *mounts, *sealed])]
     again = [word for path in ("/python", "/site", "/course") for word in ("--ro-bind", path, path)]
     become_nobody = ["/tools/setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups", "--inh-caps=-all"]
     return [
@@ -153,7 +154,7 @@ def layers(course: Sequence[Path], files: Mapping[str, int], limits: Limits, fil
 
 def _outer(mounts: Sequence[str]) -> list[str]:
     """Root's layer; only what `mounts` says is carried into the inner one."""
-    arguments = ["--unshare-pid", "--unshare-net", "--unshare-ipc", "--unshare-uts", "--die-with-parent", "--new-session"]
+    arguments = ["--unshare-pid", *APART, "--die-with-parent", "--new-session"]
     # The kernel grants a new /proc (the inner layer's) only to those who see a whole one already: hence the bind.
     arguments += ["--cap-add", "CAP_SETUID", "--cap-add", "CAP_SETGID", "--bind", "/proc", "/proc", "--dev", "/dev"]
     # A folder that bwrap makes unasked is for its owner, root, only.

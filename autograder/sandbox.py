@@ -28,7 +28,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -270,7 +270,7 @@ class Sandbox:
         if now - self._looked >= TICK:
             self._looked = now
             tree, limits = self._tree(), self.limits
-            memory = sum(map(_memory, tree))
+            memory = _memory(tree, limits.memory)
             entries, sockets = (max(map(count, tree), default=0) for count in (_entries, _sockets))
             if memory > limits.memory or entries > limits.entries or sockets > limits.sockets:
                 self.close()
@@ -322,11 +322,24 @@ class Sandbox:
             self._folder = None
 
 
-def _memory(process: psutil.Process) -> int:
-    """Bytes of memory of one process; pages shared by n processes (forks of one that has torch loaded) count 1/n."""
-    with suppress(psutil.Error, OSError):
-        return process.memory_full_info().pss
-    return 0
+def _memory(tree: Sequence[psutil.Process], enough: int) -> int:
+    """Bytes of memory of all processes: at first a bound that is quick to know, and only if that is above `enough`, exactly."""
+
+    def total(count: Callable[[psutil.Process], int]) -> int:
+        used = 0
+        for process in tree:
+            with suppress(psutil.Error, OSError):
+                used += count(process)
+        return used
+
+    bound = total(lambda process: process.memory_info().rss)
+    # Pages that n processes share (forks of one that has torch loaded) count 1/n each.
+    return bound if bound <= enough else total(_share)
+
+
+def _share(process: psutil.Process) -> int:
+    info = process.memory_full_info()
+    return info.pss + info.swap
 
 
 def _entries(process: psutil.Process) -> int:

@@ -206,9 +206,10 @@ def test_no_environment_and_no_arguments_of_the_grader_are_visible(ask, monkeypa
                     text[f"{pid}/{name}"] = open(f"/proc/{pid}/{name}", "rb").read().decode()
                 except OSError:
                     pass
-        say([text, dict(os.environ)])
+        say([text, dict(os.environ), socket.gethostname()])
     """
-    text, environment = ask(code)
+    text, environment, name = ask(code)
+    assert name == "sandbox"
     everything = json.dumps([text, environment])
     assert "hunter2" not in everything and "GRADER_SECRET" not in everything
     assert str(ROOT) not in everything and PACKAGES not in everything
@@ -510,7 +511,7 @@ def test_silence_ends_at_the_deadline(enter):
         start = time.monotonic()
         with pytest.raises(SandboxTimeout):
             box.receive(0.5)
-        assert 0.4 < time.monotonic() - start < 1.0
+        assert 0.4 < time.monotonic() - start < 2.0
 
 
 def test_dribbling_ends_at_the_deadline(enter):
@@ -524,7 +525,7 @@ def test_dribbling_ends_at_the_deadline(enter):
         start = time.monotonic()
         with pytest.raises(SandboxTimeout):
             box.receive(0.5)
-        assert 0.4 < time.monotonic() - start < 1.0
+        assert 0.4 < time.monotonic() - start < 2.0
 
 
 def test_not_listening_does_not_block_the_judge(enter):
@@ -532,7 +533,7 @@ def test_not_listening_does_not_block_the_judge(enter):
         start = time.monotonic()
         with pytest.raises(SandboxTimeout):
             box.send(bytes(16 * MiB), timeout=0.5)
-        assert 0.4 < time.monotonic() - start < 1.0
+        assert 0.4 < time.monotonic() - start < 2.0
 
 
 def test_stopping_itself_ends_at_the_deadline(enter):
@@ -638,7 +639,7 @@ def test_a_daemon_is_gone_after_close(enter):
         pids = inside(box)
         assert len(pids) >= 3
         start = time.monotonic()
-    assert time.monotonic() - start < 1
+    assert time.monotonic() - start < 2
     assert gone(pids, within=0)
 
 
