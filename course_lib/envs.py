@@ -32,7 +32,7 @@ class ChainVectorEnv(gym.vector.VectorEnv):
     Raises: ValueError if length, time_limit, slip or reward_noise is out of range.
     """
 
-    def __init__(self, num_envs=16, length=7, time_limit=10, exit_reward=8.0, slip=0.1, reward_noise=0.3):
+    def __init__(self, num_envs=16, length=7, time_limit=10, exit_reward=8.0, slip=0.1, reward_noise=0.45):
         if length < 3:
             raise ValueError(f"length must be at least 3, got {length}")
         if time_limit is not None and time_limit < 1:

@@ -7,7 +7,9 @@ one self-contained piece of HTML: the values as JSON, and a small script that dr
 
 from __future__ import annotations
 
+import base64
 import html
+import io
 import itertools
 import json
 import math
@@ -55,10 +57,7 @@ def explore(series: Callable[..., dict[str, Series]], *, title: str, x_label: st
         if value not in sliders[name]:
             raise ValueError(f"start must name a value of the slider {name}, one of {list(sliders[name])}, got {value}")
     if os.environ.get("COURSE_BOOK") == "1":
-        from IPython.display import display
-
-        setting = ", ".join(f"{name} = {value}" for name, value in initial.items())
-        display({"text/html": to_html(series, title, x_label, initial, sliders), "text/plain": f"{title} ({setting})"}, raw=True)
+        _show_recorded(series, title, x_label, initial, sliders)
     else:
         _show_live(series, title, x_label, initial, sliders)
 
@@ -72,9 +71,7 @@ def to_html(series, title: str, x_label: str, initial: dict, sliders: dict) -> s
     data = {
         "xLabel": x_label,
         "sliders": [{"name": name, "values": list(choices)} for name, choices in sliders.items()],
-        "series": [
-            {"name": name, "kind": one.kind, "x": x} for (name, one), x in zip(first.items(), abscissae, strict=True)
-        ],
+        "series": [{"name": name, "kind": one.kind, "x": x} for (name, one), x in zip(first.items(), abscissae, strict=True)],
         "panels": _panels(first, abscissae, values),
         "values": values,
     }
@@ -128,12 +125,10 @@ def _controls(initial: dict, sliders: dict) -> str:
 def _frames(data: dict) -> str:
     frames = []
     for panel in data["panels"]:
-        key = "".join(
-            f'<span class="key c{i % 5}" aria-hidden="true"></span>{html.escape(data["series"][i]["name"])}' for i in panel["series"]
-        )
-        frames.append(
-            f'<p class="panel">{html.escape(panel["label"])}:{key}</p><div><svg role="img" aria-label="{html.escape(panel["label"])}"></svg></div>'
-        )
+        names = [(i, html.escape(data["series"][i]["name"])) for i in panel["series"]]
+        key = "".join(f'<span class="key c{i % 5}" aria-hidden="true"></span>{name}' for i, name in names)
+        label = html.escape(panel["label"])
+        frames.append(f'<p class="panel">{label}:{key}</p><div><svg role="img" aria-label="{label}"></svg></div>')
     return "".join(frames)
 
 
@@ -151,25 +146,32 @@ def _table(data: dict, shown: list) -> str:
     )
 
 
+def _figure(shown: dict[str, Series], title: str, x_label: str):
+    import matplotlib.pyplot as plt
+
+    labels = list(dict.fromkeys(one.panel for one in shown.values()))
+    figure, axes = plt.subplots(len(labels), 1, figsize=(7, 2.4 * len(labels)), squeeze=False, layout="constrained")
+    for i, (name, one) in enumerate(shown.items()):
+        ax = axes[labels.index(one.panel), 0]
+        x = range(len(one.y)) if one.x is None else one.x
+        y = np.asarray(one.y, dtype=float).ravel()
+        if one.kind == "bar":
+            ax.bar(x, y, width=0.6, alpha=0.55, color=f"C{i}", label=name)
+        else:
+            ax.plot(x, y, "o-" if one.kind == "line" else "o", color=f"C{i}", label=name)
+        ax.set(ylabel=one.panel, xlabel=x_label)
+        ax.legend()
+    figure.suptitle(title)
+    return figure
+
+
 def _show_live(series, title: str, x_label: str, initial: dict, sliders: dict) -> None:
     import ipywidgets as widgets
     import matplotlib.pyplot as plt
     from IPython.display import display
 
     def draw(**setting):
-        shown = series(**setting)
-        labels = list(dict.fromkeys(one.panel for one in shown.values()))
-        figure, axes = plt.subplots(len(labels), 1, figsize=(7, 2.4 * len(labels)), squeeze=False)
-        for i, (name, one) in enumerate(shown.items()):
-            ax = axes[labels.index(one.panel), 0]
-            x = range(len(one.y)) if one.x is None else one.x
-            if one.kind == "bar":
-                ax.bar(x, one.y, width=0.6, alpha=0.55, color=f"C{i}", label=name)
-            else:
-                ax.plot(x, one.y, "o-" if one.kind == "line" else "o", color=f"C{i}", label=name)
-            ax.set(ylabel=one.panel, xlabel=x_label)
-            ax.legend()
-        figure.suptitle(title)
+        _figure(series(**setting), title, x_label)
         plt.show()
 
     controls = {
@@ -177,3 +179,23 @@ def _show_live(series, title: str, x_label: str, initial: dict, sliders: dict) -
         for name, choices in sliders.items()
     }
     display(widgets.VBox([*controls.values(), widgets.interactive_output(draw, controls)]))
+
+
+def _show_recorded(series, title: str, x_label: str, initial: dict, sliders: dict) -> None:
+    """The HTML for the book, and for readers without it (a notebook that shows recorded outputs) a picture and a sentence."""
+    import matplotlib.pyplot as plt
+    from IPython.display import display
+
+    setting = ", ".join(f"{name} = {value}" for name, value in initial.items())
+    figure = _figure(series(**initial), f"{title}\n{setting}", x_label)
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=100, facecolor="white")
+    plt.close(figure)
+    display(
+        {
+            "text/html": to_html(series, title, x_label, initial, sliders),
+            "image/png": base64.b64encode(picture.getvalue()).decode(),
+            "text/plain": f"{title} ({setting})",
+        },
+        raw=True,
+    )

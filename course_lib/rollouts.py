@@ -52,7 +52,7 @@ def collect(envs, policy, num_steps, obs):
     mode = envs.metadata.get("autoreset_mode")
     if mode != AutoresetMode.SAME_STEP:
         raise ValueError(
-            f"envs must use same-step autoreset, got {mode}; pass autoreset_mode=AutoresetMode.SAME_STEP to the vector environment"
+            f"envs must use same-step autoreset, got {mode}: make the vector environment with AutoresetMode.SAME_STEP"
         )
     columns = []
     for _ in range(num_steps):
