@@ -36,6 +36,7 @@ from autograder.execution import BookError, cache_folder, code_inputs, content_h
 from autograder.paths import COURSE_LIB, ROOT
 
 BOOK = ROOT / "book"
+STAGE = BOOK / "_stage"
 PUBLISHED = ("*.html", "searchindex.js", "_static/*", "_images/*", "_downloads/*")
 MATHJAX = ("tex-chtml-full.js", "output/chtml/fonts/**/*", "a11y/*", "sre/**/*")
 # The library's modules that decide a kill matrix: it takes minutes, so a new plot must not ask for it again.
@@ -61,7 +62,7 @@ def build(with_solutions: bool = True, out: Path | None = None) -> Path:
         for chapter in chapters:
             assemble.verify(chapter)  # first, so that a slip in the prose is not found after minutes of running code
         variant = "solved" if with_solutions else "unsolved"
-        stage, work = BOOK / "_stage" / variant, cache_folder() / f"sphinx-{variant}"
+        stage, work = STAGE / variant, cache_folder() / f"sphinx-{variant}"
         if sync(staged_files(chapters, with_solutions), stage):
             shutil.rmtree(work, ignore_errors=True)  # Sphinx never deletes the page of a source that has gone
         _render(stage, work)
@@ -121,8 +122,14 @@ def _names(names: list[str]) -> str:
     return ", ".join(f"`{name}`" for name in names)
 
 
-def _cell(text: str) -> str:
-    return " ".join(text.split()).replace("|", "\\|")
+def _cell(markdown: str) -> str:
+    """Markdown as a cell of a table."""
+    return " ".join(markdown.split()).replace("|", "\\|")
+
+
+def _plain(text: str) -> str:
+    """Plain text as a cell of a Markdown table."""
+    return " ".join(re.sub(r"([\\`*_{}\[\]<>#|~$])", r"\\\1", text).split())
 
 
 def kill_matrix_page(matrix: dict[str, list[dict]]) -> str:
@@ -131,8 +138,10 @@ def kill_matrix_page(matrix: dict[str, list[dict]]) -> str:
     for heading, rows in matrix.items():
         lines += [f"## {heading}", ""]
         for row in rows:
-            wrong = [f"| `{w['name']}` | {_cell(w['message'])} | {w['rejected']} | {w['named']} |" for w in row["misconceptions"]]
-            right = [f"| {r['name']} | {r['accepted']} |" for r in row["variants"]]
+            wrong = [
+                f"| `{w['name']}` | {_plain(w['message'])} | {w['rejected']} | {w['named']} |" for w in row["misconceptions"]
+            ]
+            right = [f"| {_plain(r['name'])} | {r['accepted']} |" for r in row["variants"]]
             lines += [f"### `{row['exercise']}`", ""]
             lines += [f"Of {row['seeds']} draws of all cases:", ""]
             lines += ["| Wrong answer | What the learner reads | Rejected | Named |", "|---|---|---|---|", *wrong, ""]

@@ -8,6 +8,7 @@ import pytest
 
 from autograder.book import docname
 from autograder.chapter import all_chapters
+from autograder.contract import references, sources
 
 SCREENSHOTS = Path(__file__).resolve().parents[2] / "test-artefacts"
 LOOKS = {  # colour scheme, width in CSS pixels
@@ -86,6 +87,16 @@ def test_notebook_can_be_downloaded_from_its_page(browser, html, name):
     with Visit(browser, html / f"{name}.html") as visit:
         target = visit.page.locator("article a[href$='.ipynb']").first.get_attribute("href")
         assert (html / name).parent.joinpath(target).resolve().is_file()
+
+
+@pytest.mark.parametrize("chapter", all_chapters(), ids=lambda chapter: chapter.assignment)
+def test_every_reference_is_on_its_page_folded(browser, html, chapter):
+    with Visit(browser, html / f"{docname(chapter)}.html") as visit:
+        folded = visit.page.locator("details", has_text="Reference solution")
+        shown = folded.all_text_contents()
+        assert folded.evaluate_all("nodes => nodes.filter(node => node.open).length") == 0
+    for reference in references(chapter, sources(chapter)).values():
+        assert any(reference.body.strip() in text for text in shown)
 
 
 def test_search_works_from_disk(browser, html):
