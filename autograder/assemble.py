@@ -206,8 +206,8 @@ def _recorded(key: str, cell: Cell, outputs: list[NotebookNode], chapter: Chapte
             parts.append(f"![{cell.alt or 'recorded figure'}](attachment:{name})")
         elif text := output.get("text", data.get("text/plain", "")).strip():
             parts.append(f"````text\n{_ANSI.sub('', text)}\n````")
-    if not parts:
-        parts.append(f"*What belongs here is on the book's page of chapter {chapter.number}.*")
+    if not parts or any("text/html" in output.get("data", {}) for output in outputs):  # HTML runs scripts that notebooks refuse
+        parts.append(f"*See it live on the book's page of chapter {chapter.number}.*")
     node = _markdown(key, "\n\n".join(parts), cell.tags)
     if attachments:
         node["attachments"] = attachments

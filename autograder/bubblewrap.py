@@ -18,6 +18,7 @@ from packaging.requirements import Requirement
 
 MiB = 1 << 20
 NOBODY = "65534"
+APART = ("--unshare-net", "--unshare-ipc", "--unshare-uts", "--hostname", "sandbox")
 LIBRARY_CACHE = ("--ro-bind-try", "/etc/ld.so.cache", "/etc/ld.so.cache")
 
 # What a learner may import, beside course_lib. Their requirements come with them; nothing else that is installed does.
@@ -45,6 +46,7 @@ class Limits:
     tmp: int = 128 * MiB
     shm: int = 64 * MiB
     entries: int = 20_000  # files and folders in these three: each, though empty, takes 1 KiB of kernel memory
+    sockets: int = 64
 
     def resources(self) -> dict[str, int]:
         return {
@@ -62,7 +64,7 @@ def closure(requirements: Sequence[str]) -> dict[str, metadata.Distribution]:
         if (need.name, frozenset(need.extras)) in done:
             continue
         done.add((need.name, frozenset(need.extras)))
-        with suppress(metadata.PackageNotFoundError):  # doctor tells of what is missing
+        with suppress(metadata.PackageNotFoundError):
             found[need.name] = metadata.distribution(need.name)
             for requirement in map(Requirement, found[need.name].requires or ()):
                 extras = {"", *need.extras}
@@ -73,9 +75,14 @@ def closure(requirements: Sequence[str]) -> dict[str, metadata.Distribution]:
 
 @functools.cache
 def packages() -> dict[str, Path]:
-    """Top-level names under /site → where they are installed. An installed `solutions` or `autograder` is not among them."""
-    tops = {}
-    for distribution in closure(LEARNER_PACKAGES).values():
+    """Top-level names under /site → where they are installed. An installed `solutions` or `autograder` is not among them.
+
+    Raises: FileNotFoundError if one of LEARNER_PACKAGES is missing: its absence inside would look like a learner's mistake.
+    """
+    tops, found = {}, closure(LEARNER_PACKAGES)
+    if missing := [name for name in LEARNER_PACKAGES if Requirement(name).name not in found]:
+        raise FileNotFoundError(f"{', '.join(missing)} not installed: run `pip install -r requirements.txt`")
+    for distribution in found.values():
         for file in distribution.files or ():
             top = file.parts[0]
             if top not in ("..", "/", "__pycache__") and not top.endswith(".pth"):
@@ -101,7 +108,10 @@ def _host_mounts() -> tuple[str, ...]:
             arguments += ["--tmpfs", f"/python/{library}/{hidden}", "--remount-ro", f"/python/{library}/{hidden}"]
     for top, path in packages().items():
         arguments += ["--ro-bind", str(path), f"/site/{top}"]
-    return (*arguments, *_system_libraries(), *LIBRARY_CACHE)
+    arguments += _system_libraries()
+    for packages_of_the_system in Path("/usr/lib").glob("python*"):
+        arguments += ["--tmpfs", str(packages_of_the_system), "--remount-ro", str(packages_of_the_system)]
+    return (*arguments, *LIBRARY_CACHE)
 
 
 def _system_libraries() -> list[str]:
@@ -133,7 +143,7 @@ def layers(course: Sequence[Path], files: Mapping[str, int], limits: Limits, fil
         mounts += ["--ro-bind", str(path.resolve()), f"/course/{path.name}"]
     sealed = [*_sealed(limits, files), "--seccomp", filter_fd]
     if os.geteuid() != 0:
-        return [([_tool("bwrap")], ["--unshare-net", "--unshare-ipc", "--unshare-uts", *mounts, *sealed])]
+        return [([_tool("bwrap")], [*APART, *mounts, *sealed])]
     again = [word for path in ("/python", "/site", "/course") for word in ("--ro-bind", path, path)]
     become_nobody = ["/tools/setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups", "--inh-caps=-all"]
     return [
@@ -144,7 +154,7 @@ def layers(course: Sequence[Path], files: Mapping[str, int], limits: Limits, fil
 
 def _outer(mounts: Sequence[str]) -> list[str]:
     """Root's layer; only what `mounts` says is carried into the inner one."""
-    arguments = ["--unshare-pid", "--unshare-net", "--unshare-ipc", "--unshare-uts", "--die-with-parent", "--new-session"]
+    arguments = ["--unshare-pid", *APART, "--die-with-parent", "--new-session"]
     # The kernel grants a new /proc (the inner layer's) only to those who see a whole one already: hence the bind.
     arguments += ["--cap-add", "CAP_SETUID", "--cap-add", "CAP_SETGID", "--bind", "/proc", "/proc", "--dev", "/dev"]
     # A folder that bwrap makes unasked is for its owner, root, only.
@@ -176,3 +186,36 @@ def _tool(name: str) -> str:
         package = {"bwrap": "bubblewrap", "setpriv": "util-linux"}[name]
         raise FileNotFoundError(f"{name} is missing: install {package} (`sudo apt install {package}`)")
     return path
+
+
+def explain(complaint: str) -> str:
+    """What bubblewrap said, in one paragraph with what can be done about it."""
+    return f"The sandbox does not start: {complaint[:500]}. {_remedy(complaint)}"
+
+
+def _remedy(complaint: str) -> str:
+    if "apparmor_restrict_unprivileged_userns" in complaint or _kernel("kernel/apparmor_restrict_unprivileged_userns") == "1":
+        return (
+            "Ubuntu's AppArmor restricts user namespaces: run `sudo sysctl kernel.apparmor_restrict_unprivileged_userns=0`, "
+            "or give /usr/bin/bwrap an AppArmor profile that allows them (`flags=(unconfined) { userns, }`)."
+        )
+    if _kernel("kernel/unprivileged_userns_clone") == "0":
+        return "User namespaces are switched off: run `sudo sysctl kernel.unprivileged_userns_clone=1`."
+    if _kernel("user/max_user_namespaces") == "0":
+        return "User namespaces are switched off: run `sudo sysctl user.max_user_namespaces=15000`."
+    if "mount proc" in complaint:
+        return "A container hides parts of /proc: start it with `--security-opt systempaths=unconfined`, or grade outside it."
+    if "usage:" in complaint or "Unknown option" in complaint:
+        return "bubblewrap 0.8 or newer is needed (bwrap --version); Debian 12 and Ubuntu 24.04 have it."
+    if "/python" in complaint or "libpython" in complaint:
+        return f"Ordinary users must be able to read the interpreter under {sys.base_prefix} and the packages beside it."
+    return (
+        "Unprivileged user namespaces must be allowed (in a container: `--security-opt seccomp=unconfined --security-opt "
+        "apparmor=unconfined`); `bwrap --unshare-user --ro-bind / / true` shows whether they are."
+    )
+
+
+def _kernel(name: str) -> str:
+    with suppress(OSError):
+        return Path("/proc/sys", name).read_text().strip()
+    return ""

@@ -1,15 +1,19 @@
-"""The `course` command: book, release, check, grade, doctor."""
+"""The `course` command."""
 
 from __future__ import annotations
 
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+if TYPE_CHECKING:
+    from autograder.assemble import Outputs
+    from autograder.chapter import Chapter
 
 # Each command imports what it needs: torch, nbgrader and Sphinx cost seconds, and `course --help` should not.
 
@@ -21,6 +25,13 @@ err = Console(stderr=True, highlight=False, soft_wrap=True)
 def _stop(message: object, status: int = BAD_INPUT) -> None:
     err.print(f"course: {message}", markup=False)
     raise typer.Exit(status)
+
+
+def _recorded(page: Chapter) -> Outputs | None:
+    """A chapter's outputs in the book, if its notebook shows any; they come from the cache, or the chapter is run."""
+    from autograder import execution
+
+    return execution.executed_outputs(page) if any("book-only" in cell.tags for cell in page.cells) else None
 
 
 @app.command()
@@ -45,8 +56,21 @@ def release(
     from autograder import release as releaser
 
     try:
-        print(f"The bundle is at {releaser.release(out, only)}")
+        print(f"The bundle is at {releaser.release(out, only, recorded=_recorded)}")
     except (ValueError, LookupError, OSError) as error:
+        _stop(error)
+
+
+@app.command()
+def hub(folder: Annotated[Path, typer.Argument(help="A new or existing folder for nbgrader's course.")]) -> None:
+    """Lay out a course for plain nbgrader: source notebooks with solutions and hidden tests, and its configuration. For teachers only."""
+    from autograder import checks, freeze, paths
+    from autograder import release as releaser
+
+    try:
+        freeze.write(checks.all_exercises(), paths.COURSE_LIB / "frozen")  # the check cells need them in the teacher's environment, too
+        print(f"nbgrader's course is at {releaser.write_nbgrader_course(folder, recorded=_recorded)}")
+    except (ValueError, OSError) as error:
         _stop(error)
 
 
@@ -92,7 +116,7 @@ def grade(
     print(f"Grades are in {out}")
     if any(verdict.status == "infra_error" for verdict in results):
         _stop("some submissions could not be graded (infra_error): grade again; `course doctor` looks for the cause", BROKEN)
-    low = [v for v in results if fail_under is not None and v.score < fail_under * v.max_score or v.status == "student_error" and fail_under]
+    low = [v for v in results if fail_under and (v.score < fail_under * v.max_score or not v.max_score)]
     if low:
         _stop(f"{len(low)} of {len(results)} submissions score under {fail_under:.0%}", LOW_SCORES)
 

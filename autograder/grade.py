@@ -61,13 +61,16 @@ def grade(
         gradebook.write_course(out, releases, db_url)
         with gradebook.GradebookWriter(db_url or f"sqlite:///{(out / 'gradebook.db').resolve()}") as book:
             for name in {assignment for _, assignment, _ in tasks} & known.keys():
-                book.register(name, releases[name])
+                _register(book, name, releases[name])
             results = []
             judged = _on_dask(tasks, scheduler, timeout) if scheduler else _here(tasks, jobs, timeout, trusted)
             for verdict, notebook in judged:
                 results.append(_write(verdict, notebook, out, book, releases))
                 progress(len(results), len(tasks), f"{verdict.student}/{verdict.assignment}")
-            exports.write_all(out, book)
+            try:
+                exports.write_all(out, book)
+            except ValueError as error:  # a verdict file that somebody has damaged
+                raise GradingError(str(error)) from None
     return sorted(results, key=lambda verdict: (verdict.student, verdict.assignment))
 
 
@@ -104,6 +107,13 @@ def _tasks(submitted: Path) -> list[tuple[str, str, Path]]:
     if not tasks:
         raise GradingError(f"{submitted}: no submissions in it. Expected STUDENT/ASSIGNMENT/ASSIGNMENT.ipynb, nbgrader's layout.")
     return tasks
+
+
+def _register(book: gradebook.GradebookWriter, assignment: str, released: NotebookNode) -> None:
+    try:
+        book.register(assignment, released)
+    except ValueError as error:  # a cell that was withdrawn holds a score given by hand
+        raise GradingError(f"{assignment}: {error}") from None
 
 
 def _here(tasks: list[tuple[str, str, Path]], jobs: int, timeout: float, trusted: bool) -> Iterator[tuple[Verdict, NotebookNode | None]]:

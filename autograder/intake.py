@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import stat
@@ -17,6 +18,7 @@ import nbformat
 
 MAX_NOTEBOOK = 20 << 20
 MAX_SIDE_FILES = 100
+MAX_NAME = 200
 MAX_SIDE_BYTES = 256 << 20
 
 
@@ -40,25 +42,34 @@ class BadNotebook(ValueError):
 def discover(submitted: Path) -> list[tuple[str, str, Path]]:
     """Every (student, assignment, folder) under `submitted`, sorted; names that begin with a dot are no submissions."""
     return [
-        (student.name, assignment.name, assignment)
+        (printable(student.name), printable(assignment.name), assignment)
         for student in sorted(_folders(submitted))
-        for assignment in sorted(_folders(student, links=True))
+        for assignment in sorted(_folders(student))
     ]
 
 
-def _folders(parent: Path, links: bool = False) -> list[Path]:
+def printable(name: str) -> str:
+    """A folder's name as our own files can bear it: unprintable characters as %XX, and an overlong name cut and told apart by a hash."""
+    safe = "".join(c if c.isprintable() else "".join(f"%{byte:02X}" for byte in os.fsencode(c)) for c in name)
+    if len(safe.encode()) > MAX_NAME:
+        safe = f"{safe.encode()[:MAX_NAME - 17].decode(errors='ignore')}~{hashlib.sha256(os.fsencode(name)).hexdigest()[:16]}"
+    return safe
+
+
+def _folders(parent: Path) -> list[Path]:
+    """Folders and links to folders; `read` refuses the links, so that each gets a verdict."""
     with os.scandir(parent) as entries:
-        return [Path(e.path) for e in entries if not e.name.startswith(".") and e.is_dir(follow_symlinks=links)]
+        return [Path(entry.path) for entry in entries if not entry.name.startswith(".") and entry.is_dir()]
 
 
 def read(student: str, assignment: str, folder: Path) -> Submission:
     """Read one submission. Whatever is wrong with it ends in `problem` or `flags`."""
     submission = Submission(student, assignment, folder)
-    if folder.is_symlink():
+    if folder.is_symlink() or folder.parent.is_symlink():
         submission.problem = "The submission's folder is a link; hand in the files themselves."
         return submission
     try:
-        submission.notebook = parse(_read_regular(folder / f"{assignment}.ipynb", MAX_NOTEBOOK))
+        submission.notebook = parse(_read_regular(folder / f"{folder.name}.ipynb", MAX_NOTEBOOK))
     except FileNotFoundError:
         found = sorted(entry.name for entry in folder.glob("*.ipynb"))[:3]
         others = f" (found: {', '.join(found)})" if found else ""
@@ -131,7 +142,7 @@ def _collect(folder: Path, submission: Submission) -> None:
         for name in sorted([*names, *linked]):
             path = Path(parent, name)
             relative = str(path.relative_to(folder))
-            if relative == f"{submission.assignment}.ipynb":
+            if relative == f"{folder.name}.ipynb":
                 continue
             status = path.lstat()
             total += status.st_size

@@ -10,7 +10,8 @@ import functools
 import hashlib
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -166,7 +167,7 @@ class _Run:
         found: dict[str, Finding] = {}
         pending = list(self.release.exercises)
         while pending and time.monotonic() < self._deadline:
-            with Sandbox(WORKER, [COURSE_LIB], self.submission.files, trusted=self.trusted) as sandbox:
+            with self._sandbox() as sandbox:
                 self._wait_until_ready(sandbox)
                 if not self._load(sandbox, pending):
                     continue
@@ -181,6 +182,16 @@ class _Run:
                         found[exercise.name] = _failed(exercise, "error", f"The call ended the process: {error}.")
                         break
         return [found.get(exercise.name) or self._timed_out(exercise) for exercise in self.release.exercises]
+
+    @contextmanager
+    def _sandbox(self) -> Iterator[Sandbox]:
+        with ExitStack() as stack:
+            try:
+                sandbox = stack.enter_context(Sandbox(WORKER, [COURSE_LIB], self.submission.files, trusted=self.trusted))
+            except ValueError as error:  # files that changed after intake had looked at them
+                self.flags.append(f"ignored_files: {error}")
+                sandbox = stack.enter_context(Sandbox(WORKER, [COURSE_LIB], trusted=self.trusted))
+            yield sandbox
 
     @staticmethod
     def _wait_until_ready(sandbox: Sandbox) -> None:

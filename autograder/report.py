@@ -45,6 +45,7 @@ body { margin: 0 auto; padding: 1.5rem 1rem 3rem; max-width: 46rem; background: 
 h1 { font-size: 1.4rem; margin: 0; }
 h2 { font-size: 1.15rem; margin: 2rem 0 .5rem; }
 h3 { font-size: 1rem; margin: 1.5rem 0 .25rem; }
+h3 code { font-weight: 600; }
 p { margin: .5rem 0; } .score { font-size: 1.6rem; font-weight: 600; margin: .75rem 0 0; }
 .notice { border-left: .3rem solid var(--wrong); background: var(--soft); padding: .6rem .9rem; }
 table { border-collapse: collapse; width: 100%; } caption { text-align: left; color: var(--neutral); padding-bottom: .4rem; }
@@ -93,7 +94,7 @@ content="default-src 'none'; style-src 'sha256-{{ style_hash }}'; base-uri 'none
 <thead><tr><th scope="col">Exercise</th><th scope="col">Outcome</th><th scope="col">Points</th></tr></thead>
 <tbody>
 {% for item in verdict.items %}
-<tr><th scope="row"><code>{{ item.exercise }}</code></th>
+<tr><th scope="row"><code>{{ item.exercise | breakable }}</code></th>
 <td class="state {{ item.state }}">
 {%- if item in explained %}<a href="#exercise-{{ loop.index }}">{{ words[item.state] }}</a>
 {%- else %}{{ words[item.state] }}{% endif %}</td>
@@ -121,6 +122,7 @@ content="default-src 'none'; style-src 'sha256-{{ style_hash }}'; base-uri 'none
 
 _environment = Environment(autoescape=True, trim_blocks=True)
 _environment.filters["points"] = points
+_environment.filters["breakable"] = lambda name: Markup("_<wbr>").join(name.split("_"))  # long names on a phone; join escapes
 _template = _environment.from_string(_PAGE)
 
 

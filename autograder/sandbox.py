@@ -28,7 +28,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -40,6 +40,7 @@ from autograder.bubblewrap import ENVIRONMENT, Limits, MiB
 
 MAX_FRAME = 64 * MiB
 MAX_FILES = 200  # each is an open descriptor of ours while the sandbox starts
+MAX_FILES_SIZE = 256 * MiB  # together; they lie in memory
 START_TIMEOUT = 60.0  # seconds until the interpreter runs; only an overloaded machine needs more than 0.2
 TICK = 0.2  # seconds between two looks at the memory
 PYTHON_OPTIONS = ("-P", "-s", "-S", "-B")  # the standard library's path only, no bytecode; -I would ignore PYTHONHASHSEED
@@ -112,11 +113,12 @@ class Sandbox:
     Args:
       script: the program, a host file; runs as /course/<its name>.
       modules: files and folders that appear as /course/<their name>.
-      files: name relative to /work → regular file of the host (copied when the sandbox starts; at most MAX_FILES).
+      files: name relative to /work → regular file of the host (copied when the sandbox starts).
       limits: see Limits.
       trusted: run one's own code in an ordinary subprocess instead. Nothing is confined and no limit holds.
 
-    Raises: SandboxUnavailable on entering; ValueError for a file or a name that intake should have refused.
+    Raises: SandboxUnavailable on entering; ValueError for a file or a name that intake should have refused: not a regular
+    file, not a plain relative name, more than MAX_FILES or MAX_FILES_SIZE.
     """
 
     def __init__(
@@ -157,8 +159,9 @@ class Sandbox:
                 except SandboxError as error:
                     self.close()
                     text = complaints.read(4000).decode(errors="replace").strip()
-                    raise SandboxUnavailable(_explain(text or str(error))) from None
-                self._looked = 0.0 if not self.trusted else float("inf")
+                    raise SandboxUnavailable(bubblewrap.explain(text or str(error))) from None
+                if not self.trusted:
+                    self._looked = 0.0
         except BaseException:
             self.close()
             raise
@@ -183,13 +186,15 @@ class Sandbox:
                 return str(fd)
 
             files = {name: handed_on(_open_regular(path)) for name, path in self.files.items()}
+            if sum(os.fstat(fd).st_size for fd in files.values()) > MAX_FILES_SIZE:
+                raise ValueError(f"more than {MAX_FILES_SIZE // MiB} MiB of files cannot be handed to the sandbox")
             boot = json.dumps([channel, f"/course/{self.script.name}", ["/course", "/site", "/work"], self.limits.resources()])
             command = ["/python/bin/python", *PYTHON_OPTIONS, "-c", BOOTSTRAP, boot]
             try:
                 layers = bubblewrap.layers([self.script, *self.modules], files, self.limits, memory_file(seccomp.program()))
             except (FileNotFoundError, NotImplementedError) as error:
                 raise SandboxUnavailable(f"The sandbox does not start: {error}.") from error
-            # bwrap is process 1 inside: its learner could read there what it were given as arguments or environment.
+            # bwrap is process 1 inside, where a learner reads its arguments and environment: it gets none that tell anything.
             for words, arguments in reversed(layers):
                 packed = b"".join(os.fsencode(argument) + b"\0" for argument in arguments)
                 command = [*words, "--args", memory_file(packed), "--", *command]
@@ -264,12 +269,14 @@ class Sandbox:
         self._open_socket().settimeout(min(TICK, deadline - now))
         if now - self._looked >= TICK:
             self._looked = now
-            tree = self._tree()
-            used, entries = sum(map(_memory, tree)), max(map(_entries, tree), default=0)
-            if used > self.limits.memory or entries > self.limits.entries:
+            tree, limits = self._tree(), self.limits
+            memory = _memory(tree, limits.memory)
+            entries, sockets = (max(map(count, tree), default=0) for count in (_entries, _sockets))
+            if memory > limits.memory or entries > limits.entries or sockets > limits.sockets:
                 self.close()
-                allowed = f"{self.limits.memory // MiB} MiB and {self.limits.entries} are allowed"
-                raise SandboxDied(f"killed for its memory: {used // MiB} MiB in use, {entries} files made; {allowed}")
+                used = f"{memory // MiB} MiB, {entries} files and {sockets} sockets"
+                allowed = f"{limits.memory // MiB}, {limits.entries} and {limits.sockets}"
+                raise SandboxDied(f"killed for its memory: {used} in use; allowed are {allowed}")
 
     def _tree(self) -> list[psutil.Process]:
         """All processes inside, process 1 of the namespace first. A daemon cannot leave: its parent becomes that process 1."""
@@ -283,7 +290,7 @@ class Sandbox:
         status = None
         if self._process is not None:
             with suppress(subprocess.TimeoutExpired):
-                status = self._process.wait(timeout=1)
+                status = self._process.wait(timeout=0.5)
         if status is None:
             return SandboxDied("it closed its connection to the judge")
         number = -status if status < 0 else status - 128  # bwrap reports a signal as a shell does
@@ -315,11 +322,24 @@ class Sandbox:
             self._folder = None
 
 
-def _memory(process: psutil.Process) -> int:
-    """Bytes of memory of one process; pages shared by n processes (forks of one that has torch loaded) count 1/n."""
-    with suppress(psutil.Error, OSError):
-        return process.memory_full_info().pss
-    return 0
+def _memory(tree: Sequence[psutil.Process], enough: int) -> int:
+    """Bytes of memory of all processes: at first a bound that is quick to know, and only if that is above `enough`, exactly."""
+
+    def total(count: Callable[[psutil.Process], int]) -> int:
+        used = 0
+        for process in tree:
+            with suppress(psutil.Error, OSError):
+                used += count(process)
+        return used
+
+    bound = total(lambda process: process.memory_info().rss)
+    # Pages that n processes share (forks of one that has torch loaded) count 1/n each.
+    return bound if bound <= enough else total(_share)
+
+
+def _share(process: psutil.Process) -> int:
+    info = process.memory_full_info()
+    return info.pss + info.swap
 
 
 def _entries(process: psutil.Process) -> int:
@@ -330,40 +350,14 @@ def _entries(process: psutil.Process) -> int:
     return 0
 
 
-# --- does it work here? ---------------------------------------------------------------------------------------------
-
-
-def _explain(complaint: str) -> str:
-    """What bubblewrap said, in one paragraph with what can be done about it."""
-    return f"The sandbox does not start: {complaint[:500]}. {_remedy(complaint)}"
-
-
-def _remedy(complaint: str) -> str:
-    if "apparmor_restrict_unprivileged_userns" in complaint or _kernel("kernel/apparmor_restrict_unprivileged_userns") == "1":
-        return (
-            "Ubuntu's AppArmor restricts user namespaces: run `sudo sysctl kernel.apparmor_restrict_unprivileged_userns=0`, "
-            "or give /usr/bin/bwrap an AppArmor profile that allows them (`flags=(unconfined) { userns, }`)."
-        )
-    if _kernel("kernel/unprivileged_userns_clone") == "0":
-        return "User namespaces are switched off: run `sudo sysctl kernel.unprivileged_userns_clone=1`."
-    if _kernel("user/max_user_namespaces") == "0":
-        return "User namespaces are switched off: run `sudo sysctl user.max_user_namespaces=15000`."
-    if "mount proc" in complaint:
-        return "A container hides parts of /proc: start it with `--security-opt systempaths=unconfined`, or grade outside it."
-    if "usage:" in complaint or "Unknown option" in complaint:
-        return "bubblewrap 0.8 or newer is needed (bwrap --version); Debian 12 and Ubuntu 24.04 have it."
-    if "/python" in complaint or "libpython" in complaint:
-        return f"Ordinary users must be able to read the interpreter under {sys.base_prefix} and the packages beside it."
-    return (
-        "Unprivileged user namespaces must be allowed (in a container: `--security-opt seccomp=unconfined --security-opt "
-        "apparmor=unconfined`); `bwrap --unshare-user --ro-bind / / true` shows whether they are."
-    )
-
-
-def _kernel(name: str) -> str:
+def _sockets(process: psutil.Process) -> int:
+    """Sockets in a process's network namespace; what lies in them, up to some MiB each, counts as nobody's memory."""
     with suppress(OSError):
-        return Path("/proc/sys", name).read_text().strip()
-    return ""
+        return int(Path(f"/proc/{process.pid}/net/sockstat").read_text().split()[2])  # "sockets: used 5 …"
+    return 0
+
+
+# --- does it work here? ---------------------------------------------------------------------------------------------
 
 
 PROBE = """

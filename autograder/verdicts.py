@@ -51,9 +51,9 @@ def plain_name(name: str) -> str:
     return name
 
 
-def _points(what: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
-        raise ValueError(f"{what} must be a finite number of at least 0, got {value!r}")
+def _points(what: str, value: Any, least: float = 0.0) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value < least:
+        raise ValueError(f"{what} must be a finite number of at least {least}, got {value!r}")
     return float(value)
 
 
@@ -123,7 +123,7 @@ class Verdict:
             status=raw.status,
             score=_points("score", raw.score),
             max_score=_points("max_score", raw.max_score),
-            manual_score=None if raw.manual_score is None else _points("manual_score", raw.manual_score),
+            manual_score=None if raw.manual_score is None else _points("manual_score", raw.manual_score, -math.inf),  # as typed
             manual_max_score=_points("manual_max_score", raw.manual_max_score),
             items=tuple(Item.of(item) for item in raw.items),
             flags=tuple(flags),

@@ -61,13 +61,13 @@ def collect(envs, policy, num_steps, obs):
             actions = policy(before)
         obs, rewards, terminated, truncated, info = envs.step(actions.numpy())
         columns.append((before, actions, rewards, true_next_obs(obs, info), terminated, truncated))
-    before, actions, rewards, successors, terminated, truncated = zip(*columns, strict=True)
+    befores, chosen, paid, successors, ends, cuts = zip(*columns, strict=True)
     rollout = Rollout(
-        obs=torch.stack(before),
-        actions=torch.stack(actions),
-        rewards=torch.as_tensor(np.stack(rewards), dtype=torch.float32),
+        obs=torch.stack(befores),
+        actions=torch.stack(chosen),
+        rewards=torch.as_tensor(np.stack(paid), dtype=torch.float32),
         next_obs=torch.as_tensor(np.stack(successors), dtype=torch.float32),
-        terminated=torch.as_tensor(np.stack(terminated)),
-        truncated=torch.as_tensor(np.stack(truncated)),
+        terminated=torch.as_tensor(np.stack(ends)),
+        truncated=torch.as_tensor(np.stack(cuts)),
     )
     return rollout, obs

@@ -2,6 +2,7 @@ import re
 
 import nbformat
 import pytest
+from nbformat.v4 import new_output
 
 from autograder import assemble
 from autograder.chapter import ChapterError
@@ -122,7 +123,14 @@ def test_book_only_cells_become_what_was_recorded_or_say_where_to_look(tiny, vie
     recorded = next(cell for cell in views["student"].cells if cell.id == "ch99-006")
     assert recorded.source == "````text\nrecorded\n````\n\n![A rising line.](attachment:ch99-006-1.png)"
     assert recorded.attachments["ch99-006-1.png"] == {"image/png": tiny.outputs[4][1].data["image/png"]}
-    assert _sources(views["unrecorded"])["ch99-006"] == "*What belongs here is on the book's page of chapter 99.*"
+    assert _sources(views["unrecorded"])["ch99-006"] == "*See it live on the book's page of chapter 99.*"
+
+
+def test_what_is_recorded_of_an_interactive_figure_is_its_text_and_where_to_find_it(tiny):
+    outputs = [*tiny.outputs[:-1], [new_output("display_data", {"text/html": "<script></script>", "text/plain": "Two sliders"})]]
+    view = assemble.student_view(tiny.chapter, outputs, tiny.sources(tiny.chapter))
+    expected = "````text\nTwo sliders\n````\n\n*See it live on the book's page of chapter 99.*"
+    assert _sources(view)["ch99-006"] == expected
 
 
 def test_references_close_the_page(views):

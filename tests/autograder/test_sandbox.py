@@ -23,6 +23,7 @@ from autograder import bubblewrap, sandbox
 from autograder.sandbox import Limits, MiB, Sandbox, SandboxDied, SandboxGarbage, SandboxTimeout, SandboxUnavailable
 
 ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = str(Path(pytest.__file__).parents[1])  # where this machine has installed them
 
 PRELUDE = """
 import ctypes, errno, json, os, signal, socket, sys, threading, time
@@ -129,9 +130,9 @@ def test_the_learners_packages_import_and_work_within_the_limits(ask):
 
 def test_starting_costs_little_beside_the_interpreter(enter):
     with enter("say(1)"):
-        pass  # the mount list is computed once
+        pass  # the mount list is made once in a process: that takes 0.5 s
     best = min(_seconds_to_start(enter) for _ in range(3))
-    assert best < 0.3  # 0.08 s on an idle machine
+    assert best < 0.5  # 0.1 s on an idle machine
 
 
 def _seconds_to_start(enter):
@@ -183,7 +184,7 @@ def test_trusted_runs_the_same_script_without_bubblewrap(enter, tmp_path):
 def test_no_file_of_the_host_is_visible(ask):
     code = f"""
         paths = ["/etc/passwd", "/etc/shadow", "/etc/hostname", "/root", "/home", "/var", "/run", "/sys", "/opt", "/mnt",
-                 "/usr/bin", "/usr/local", "/tools", "/oldroot", "/newroot", {str(ROOT)!r}, {str(Path.home())!r}, {sys.prefix!r}]
+                 "/usr/bin", "/usr/local", "/tools", "/oldroot", "/newroot", {str(ROOT)!r}, {str(Path.home())!r}, {PACKAGES!r}]
         found = [path for path in paths if os.path.exists(path)]
         bases = ("/work", "/proc/self/cwd", "/proc/1/root", "/proc/1/cwd")
         up = [os.path.exists(f"{{base}}/../../../../{str(ROOT)[1:]}") for base in bases]
@@ -205,12 +206,13 @@ def test_no_environment_and_no_arguments_of_the_grader_are_visible(ask, monkeypa
                     text[f"{pid}/{name}"] = open(f"/proc/{pid}/{name}", "rb").read().decode()
                 except OSError:
                     pass
-        say([text, dict(os.environ)])
+        say([text, dict(os.environ), socket.gethostname()])
     """
-    text, environment = ask(code)
+    text, environment, name = ask(code)
+    assert name == "sandbox"
     everything = json.dumps([text, environment])
     assert "hunter2" not in everything and "GRADER_SECRET" not in everything
-    assert str(ROOT) not in everything and sys.prefix not in everything
+    assert str(ROOT) not in everything and PACKAGES not in everything
     assert text["1/environ"] in ("", "PWD=/\0")
     assert set(environment) <= {*bubblewrap.ENVIRONMENT, "LD_LIBRARY_PATH", "PWD", "LC_CTYPE"}
 
@@ -241,7 +243,8 @@ def test_solutions_autograder_and_nbgrader_cannot_be_imported(ask):
     code = """
         import importlib
         names = ["solutions", "solutions.ch44", "autograder", "autograder.sandbox", "nbgrader", "course_lib", "pytest", "dask"]
-        sys.path += ["/python/lib/python3.11/site-packages", "/python/lib/python3.11/dist-packages"]
+        sys.path += ["/python/lib/python3.11/site-packages", "/python/lib/python3.11/dist-packages",
+                     "/usr/lib/python3/dist-packages", "/usr/local/lib/python3.11/dist-packages"]
         say({name: outcome(importlib.import_module, name) for name in names})
     """
     assert set(ask(code).values()) == {"ModuleNotFoundError"}
@@ -476,6 +479,19 @@ def test_a_million_empty_files_are_noticed(enter):
         box.receive(10)
 
 
+def test_full_sockets_are_noticed(enter):
+    code = """
+        kept = []
+        for _ in range(100):
+            kept += socket.socketpair()
+            kept[-1].setblocking(False)
+            outcome(lambda: [kept[-1].send(bytes(30000)) for _ in range(100)])
+        time.sleep(100)
+    """
+    with enter(code) as box, pytest.raises(SandboxDied, match="sockets"):
+        box.receive(10)
+
+
 def test_everything_inside_is_first_in_line_for_the_oom_killer(ask):
     code = """
         reader, writer = os.pipe()
@@ -495,7 +511,7 @@ def test_silence_ends_at_the_deadline(enter):
         start = time.monotonic()
         with pytest.raises(SandboxTimeout):
             box.receive(0.5)
-        assert 0.4 < time.monotonic() - start < 1.0
+        assert 0.4 < time.monotonic() - start < 2.0
 
 
 def test_dribbling_ends_at_the_deadline(enter):
@@ -509,7 +525,7 @@ def test_dribbling_ends_at_the_deadline(enter):
         start = time.monotonic()
         with pytest.raises(SandboxTimeout):
             box.receive(0.5)
-        assert 0.4 < time.monotonic() - start < 1.0
+        assert 0.4 < time.monotonic() - start < 2.0
 
 
 def test_not_listening_does_not_block_the_judge(enter):
@@ -517,7 +533,7 @@ def test_not_listening_does_not_block_the_judge(enter):
         start = time.monotonic()
         with pytest.raises(SandboxTimeout):
             box.send(bytes(16 * MiB), timeout=0.5)
-        assert 0.4 < time.monotonic() - start < 1.0
+        assert 0.4 < time.monotonic() - start < 2.0
 
 
 def test_stopping_itself_ends_at_the_deadline(enter):
@@ -623,7 +639,7 @@ def test_a_daemon_is_gone_after_close(enter):
         pids = inside(box)
         assert len(pids) >= 3
         start = time.monotonic()
-    assert time.monotonic() - start < 1
+    assert time.monotonic() - start < 2
     assert gone(pids, within=0)
 
 
@@ -690,6 +706,27 @@ def test_odd_names_are_only_names(ask, tmp_path):
     assert sorted(ask("say(sorted(os.listdir()))", files=dict.fromkeys(names, tmp_path / "given"))) == sorted(names)
 
 
+def test_more_files_than_fit_are_refused(enter, tmp_path):
+    with open(tmp_path / "given", "wb") as file:
+        file.truncate(sandbox.MAX_FILES_SIZE + 1)
+    with pytest.raises(ValueError, match="256 MiB"), enter("say(1)", files={"given": tmp_path / "given"}):
+        pass
+    with pytest.raises(ValueError, match="at most"):
+        enter("say(1)", files={str(number): tmp_path / "given" for number in range(sandbox.MAX_FILES + 1)})
+
+
+def test_a_missing_package_is_ours_not_the_learners(enter, monkeypatch):
+    monkeypatch.setattr(bubblewrap, "LEARNER_PACKAGES", ("numpy", "no-such-package"))
+    for cached in (bubblewrap.packages, bubblewrap._host_mounts):
+        cached.cache_clear()
+    try:
+        with pytest.raises(SandboxUnavailable, match="no-such-package not installed"), enter("say(1)"):
+            pass
+    finally:
+        for cached in (bubblewrap.packages, bubblewrap._host_mounts):
+            cached.cache_clear()
+
+
 def test_a_large_file_handed_in_does_not_use_up_the_learners_space(ask, tmp_path):
     (tmp_path / "weights").write_bytes(bytes(20 * MiB))
     code = f"""
@@ -730,15 +767,15 @@ def test_a_failing_bubblewrap_is_ours_and_explained(enter, monkeypatch, tmp_path
     fake.write_text(f'#!/bin/sh\necho "{complaint}" >&2\nexit 1\n')
     fake.chmod(0o755)
     monkeypatch.setenv("PATH", f"{fake.parent}:{os.environ['PATH']}")
-    monkeypatch.setattr(sandbox, "_kernel", lambda name: "")
+    monkeypatch.setattr(bubblewrap, "_kernel", lambda name: "")
     with pytest.raises(SandboxUnavailable, match=advice) as caught, enter("say(1)"):
         pass
     assert complaint in str(caught.value)
 
 
 def test_apparmor_is_named_where_it_is_to_blame(monkeypatch):
-    monkeypatch.setattr(sandbox, "_kernel", lambda name: "1" if "apparmor" in name else "")
-    assert "sysctl kernel.apparmor_restrict_unprivileged_userns=0" in sandbox._explain(
+    monkeypatch.setattr(bubblewrap, "_kernel", lambda name: "1" if "apparmor" in name else "")
+    assert "sysctl kernel.apparmor_restrict_unprivileged_userns=0" in bubblewrap.explain(
         "bwrap: setting up uid map: Permission denied"
     )
 

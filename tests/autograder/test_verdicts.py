@@ -89,6 +89,11 @@ def test_a_verdict_built_in_code_is_cleaned_when_it_is_written(tmp_path):
     assert "\x1b" not in from_json(path.read_text(encoding="utf-8")).flags[0]
 
 
+@pytest.mark.parametrize("score", [-1.0, 99.0])
+def test_whatever_a_teacher_has_typed_is_kept(score):
+    assert from_json(to_json(verdict(manual_score=score))).manual_score == score
+
+
 def test_no_number_of_flags_makes_a_verdict_too_big():
     one = Verdict.of(verdict(flags=[f"linked file {n} " + "x" * 5000 for n in range(20_000)]))
     assert len(one.flags) == verdicts.MAX_FLAGS + 1

@@ -1,0 +1,121 @@
+"""What works on this machine, and how to mend what does not: `checks()` looks, `report()` prints a table for `course doctor`."""
+
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from rich.console import Console
+from rich.table import Table
+
+from autograder import sandbox
+
+ROOT = Path(__file__).resolve().parents[1]
+NEEDED_DISK = 2 << 30  # bytes: a built book, a gradebook, the reports of a class
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing looked at. `remedy` is empty when `ok`; a check that is not `required` may fail on a working machine."""
+
+    name: str
+    ok: bool
+    detail: str
+    remedy: str = ""
+    required: bool = True
+
+
+def checks() -> list[Check]:
+    """Looks at everything, the quick things first; a few seconds, most of them for importing torch inside the sandbox."""
+    looks: tuple[Callable[[], Check], ...] = (_python, _packages, _torch, _sandbox, _nbgrader, _frozen, _disk, _browser)
+    return [look() for look in looks]
+
+
+def report(console: Console | None = None) -> int:
+    """Prints the checks as a table; 0 if everything that is required works, else 1."""
+    found = checks()
+    table = Table("", "check", "found", "what to do", title="course doctor")
+    for check in found:
+        mark = "[green]ok" if check.ok else "[red]no" if check.required else "[yellow]no (optional)"
+        table.add_row(mark, check.name, check.detail, check.remedy)
+    (console or Console()).print(table)
+    return 0 if all(check.ok for check in found if check.required) else 1
+
+
+def _python() -> Check:
+    ok = sys.version_info[:2] == (3, 11)
+    return Check("Python", ok, platform.python_version(), "" if ok else "Make the environment with Python 3.11.")
+
+
+def _packages() -> Check:
+    path = ROOT / "requirements.txt"
+    if not path.is_file():
+        return Check("packages", False, "requirements.txt not found", "Run from a checkout: pip install --editable .")
+    lines = (line.strip() for line in path.read_text().splitlines())
+    pins = [Requirement(line) for line in lines if line and not line.startswith(("#", "-"))]
+    wrong = [f"{pin.name} {_installed(pin.name)} instead of {pin.specifier}" for pin in pins if not _satisfied(pin)]
+    if wrong:
+        return Check("packages", False, "; ".join(wrong), "pip install -r requirements.txt")
+    return Check("packages", True, f"{len(pins)} as pinned")
+
+
+def _installed(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return "missing"
+
+
+def _satisfied(pin: Requirement) -> bool:
+    version = _installed(pin.name)
+    return version != "missing" and pin.specifier.contains(version, prereleases=True)
+
+
+def _torch() -> Check:
+    try:
+        import torch  # here, because it takes seconds
+
+        ok = float(torch.ones(3).sum()) == 3.0
+    except Exception as error:
+        return Check("torch", False, f"{type(error).__name__}: {error}"[:300], "pip install -r requirements.txt")
+    return Check("torch", ok, f"{torch.__version__}, {torch.get_num_threads()} threads")
+
+
+def _sandbox() -> Check:
+    if problems := sandbox.probe(torch=True):
+        detail = "; ".join(problem.what for problem in problems)
+        return Check("sandbox", False, detail, " ".join(problem.remedy for problem in problems))
+    user = "root, through a second layer that becomes nobody" if os.geteuid() == 0 else "an ordinary user"
+    return Check("sandbox", True, f"bubblewrap works as {user}; torch imports inside")
+
+
+def _nbgrader() -> Check:
+    # nbgrader calls the program alembic to bring an old gradebook's tables up to date.
+    if shutil.which("alembic"):
+        return Check("nbgrader", _installed("nbgrader") != "missing", f"{_installed('nbgrader')}, alembic on PATH")
+    remedy = f"Put this environment's programs first: export PATH={Path(sys.executable).parent}:$PATH"
+    return Check("nbgrader", False, "the program alembic is not on PATH", remedy)
+
+
+def _frozen() -> Check:
+    count = len(list((ROOT / "course_lib" / "frozen").glob("*.npz")))
+    remedy = "" if count else "Nothing to do: releasing or building freezes them. Until then check() in a notebook finds none."
+    return Check("frozen checks", count > 0, f"{count} exercises", remedy, required=False)
+
+
+def _disk() -> Check:
+    free = shutil.disk_usage(Path.cwd()).free
+    remedy = "" if free >= NEEDED_DISK else f"Free some space: {NEEDED_DISK >> 30} GiB are wanted."
+    return Check("disk", free >= NEEDED_DISK, f"{free / 2**30:.1f} GiB free in this folder", remedy)
+
+
+def _browser() -> Check:
+    found = next(filter(None, map(shutil.which, BROWSERS)), None)
+    remedy = "" if found else "Only the book's browser tests need one: apt install chromium."
+    return Check("browser", found is not None, found or "none", remedy, required=False)

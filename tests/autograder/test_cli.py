@@ -1,0 +1,79 @@
+"""The command line: bad input gets one clear line and the right exit status, and nothing is written."""
+
+import pytest
+from nbformat.v4 import new_notebook
+from typer.testing import CliRunner
+
+from autograder import cli, exports, grade, sandbox
+from autograder.verdicts import Verdict
+
+
+def run(*arguments):
+    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+
+
+@pytest.mark.parametrize("arguments", [["grade"], ["grade", "x", "--jobs", "0"], ["grade", "x", "--timeout", "0"], ["nonsense"], ["check"]])
+def test_missing_and_wrong_arguments_are_refused(arguments):
+    assert run(*arguments).exit_code == 2
+
+
+def test_a_missing_folder_says_what_to_give(tmp_path):
+    result = run("grade", tmp_path / "none", "--out", tmp_path / "out")
+    assert result.exit_code == 2 and "no such folder" in result.output and "STUDENT/ASSIGNMENT" in result.output
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_without_submissions_says_what_it_looked_for(tmp_path):
+    (tmp_path / "submitted" / ".hidden").mkdir(parents=True)
+    result = run("grade", tmp_path / "submitted", "--out", tmp_path / "out")
+    assert result.exit_code == 2 and "no submissions" in result.output
+    assert not (tmp_path / "out").exists()
+
+
+def test_without_a_sandbox_nothing_is_graded(tmp_path, monkeypatch):
+    (tmp_path / "submitted" / "s1" / "ch44").mkdir(parents=True)
+
+    def unavailable():
+        raise sandbox.SandboxUnavailable("bubblewrap is missing: apt install bubblewrap")
+
+    monkeypatch.setattr(sandbox, "require", unavailable)
+    result = run("grade", tmp_path / "submitted", "--out", tmp_path / "out")
+    assert result.exit_code == 2 and "apt install bubblewrap" in result.output and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "arguments", "status"),
+    [
+        ([("graded", 5.0)], [], 0),
+        ([("graded", 5.0), ("student_error", 0.0)], [], 0),
+        ([("needs_review", 0.0)], [], 0),
+        ([("graded", 5.0)], ["--fail-under", "0.5"], 0),
+        ([("graded", 4.9)], ["--fail-under", "0.5"], 1),
+        ([("graded", 5.0), ("infra_error", 0.0)], [], 3),
+        ([("graded", 4.0), ("infra_error", 0.0)], ["--fail-under", "0.5"], 3),
+    ],
+)
+def test_the_exit_status_tells_wrong_work_from_broken_machinery(tmp_path, monkeypatch, verdicts, arguments, status):
+    results = [Verdict(f"s{i}", "ch44", kind, score, 10.0) for i, (kind, score) in enumerate(verdicts)]
+    monkeypatch.setattr(grade, "grade", lambda *_args, **_kwargs: results)
+    monkeypatch.setattr(exports, "table", lambda _results: "")
+    assert run("grade", tmp_path, *arguments).exit_code == status
+
+
+def test_an_unknown_assignment_under_fail_under_is_wrong_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(grade, "grade", lambda *_args, **_kwargs: [Verdict("s", "ch4", "student_error", 0.0, 0.0)])
+    monkeypatch.setattr(exports, "table", lambda _results: "")
+    assert run("grade", tmp_path, "--fail-under", "0.1").exit_code == 1
+
+
+def test_an_unknown_chapter_cannot_be_released(tmp_path):
+    result = run("release", "--only", "ch9999", "--out", tmp_path / "bundle")
+    assert result.exit_code == 2 and "ch9999" in result.output and not (tmp_path / "bundle").exists()
+
+
+def test_what_is_no_notebook_cannot_be_checked(tmp_path):
+    (tmp_path / "x.ipynb").write_text("not json")
+    assert run("check", tmp_path / "x.ipynb").exit_code == 2
+    assert run("check", tmp_path / "none.ipynb").exit_code == 2
+    (tmp_path / "empty.ipynb").write_text(str(new_notebook()).replace("'", '"'))
+    assert run("check", tmp_path / "empty.ipynb").exit_code == 2

@@ -1,0 +1,53 @@
+"""The doctor is quiet on a working machine, names what is broken on another, and its exit status tells the two apart."""
+
+import io
+
+import pytest
+from rich.console import Console
+
+from autograder import doctor, sandbox
+from autograder.doctor import Check
+
+
+def test_this_machine_works():
+    found = {check.name: check for check in doctor.checks()}
+    assert [check for check in found.values() if check.required and not check.ok] == []
+    assert list(found) == ["Python", "packages", "torch", "sandbox", "nbgrader", "frozen checks", "disk", "browser"]
+    assert all(check.ok or check.remedy for check in found.values())
+
+
+def report(monkeypatch, *found):
+    monkeypatch.setattr(doctor, "checks", lambda: list(found))
+    output = io.StringIO()
+    return doctor.report(Console(file=output, width=200)), output.getvalue()
+
+
+def test_only_what_is_required_counts(monkeypatch):
+    works, missing = Check("a", True, "fine"), Check("b", False, "not there", "apt install b", required=False)
+    status, text = report(monkeypatch, works, missing)
+    assert status == 0 and "apt install b" in text and "optional" in text
+    status, text = report(monkeypatch, works, Check("c", False, "broken", "mend it"))
+    assert status == 1 and "mend it" in text
+
+
+def test_a_missing_or_different_package_is_named(monkeypatch, tmp_path):
+    (tmp_path / "requirements.txt").write_text("# a comment\n-c constraints.txt\nnumpy==1.0\nno-such-package[x]==2\nrich>=1\n")
+    monkeypatch.setattr(doctor, "ROOT", tmp_path)
+    check = doctor._packages()
+    assert not check.ok and "numpy" in check.detail and "no-such-package missing" in check.detail and "rich" not in check.detail
+
+
+def test_a_build_label_does_not_make_another_version():
+    assert doctor._satisfied(doctor.Requirement("torch==2.13.0"))  # installed as 2.13.0+cpu on machines without a GPU
+
+
+def test_a_broken_sandbox_is_reported_with_its_remedy(monkeypatch):
+    monkeypatch.setattr(sandbox, "probe", lambda torch: [sandbox.Problem("no sandbox", "apt install bubblewrap")])
+    assert doctor._sandbox() == Check("sandbox", False, "no sandbox", "apt install bubblewrap")
+
+
+@pytest.mark.parametrize("look", [doctor._nbgrader, doctor._browser])
+def test_missing_programs_come_with_a_remedy(monkeypatch, look):
+    monkeypatch.setenv("PATH", "/nowhere")
+    check = look()
+    assert not check.ok and check.remedy
