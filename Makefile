@@ -1,0 +1,42 @@
+# make book    build book/_build/html/index.html          make test   all tests (installs Chromium and bubblewrap if it may)
+# make release write the students' bundle into release/   make check  style, types and the quick tests
+# The environment is .venv; it is brought up to date whenever the pins or pyproject.toml change.
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+BIN := .venv/bin
+INSTALLED := .venv/.installed
+QUICK := --ignore=tests/book --ignore=tests/autograder/test_killmatrix.py
+
+.PHONY: book release test check install clean
+
+book: install
+	$(BIN)/course book
+
+release: install
+	$(BIN)/course release
+
+test: install
+	tools/system-packages
+	$(BIN)/python -m pytest -n 2
+
+check: install
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/python -m pytest -q $(QUICK)
+
+install: $(INSTALLED)
+
+$(INSTALLED): requirements.txt constraints.txt pyproject.toml
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null || { \
+	  echo "This course is pinned to Python 3.11, and '$(PYTHON)' is another version or missing."; \
+	  echo "Install 3.11 (Debian, Ubuntu: apt-get install python3.11-venv; or use pyenv, conda or uv), or name it: make PYTHON=/path/to/python3.11"; \
+	  exit 1; }
+	"$(PYTHON)" -m venv .venv
+	$(BIN)/python -m pip install --quiet -r requirements.txt
+	$(BIN)/python -m pip install --quiet --no-deps -e .
+	touch $@
+
+clean:
+	rm -rf book/_build book/_stage book/_cache course_lib/frozen test-artefacts build *.egg-info
+	find . -name __pycache__ -type d -not -path './.venv/*' -prune -exec rm -rf {} +
