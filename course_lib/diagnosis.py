@@ -123,6 +123,8 @@ def _explanations(exercise: FrozenExercise, pairs: list[tuple[FrozenCase, Observ
             shown = case.misconceptions[name]
             signature |= min((differing_facets(shown, right, case) for right in case.expected), key=len)
             unlike |= differing_facets(seen, shown, case)
+            if signature & unlike or not signature <= set(failed):  # no later case can mend that
+                break
         explains_values = "values" in signature or "values" not in failed  # else it would name a scratch on a wreck
         if signature and signature <= set(failed) and not signature & unlike and explains_values:
             explained[name] = signature
