@@ -207,7 +207,7 @@ def _clip(r, a, e):
 
 
 def _normalised(a):
-    return (a - a.mean()) / (a.std(correction=0) + 1e-8)
+    return (a - a.mean()) / (a.std() + 1e-8)
 
 
 def _loss_misconceptions(objective):
