@@ -35,7 +35,7 @@ def diagnose(exercise: FrozenExercise, observations: Sequence[Observation]) -> F
 
     Points are paid by facet, and only together with right values. A misconception is named if, in every facet in which it differs
     from the reference, the function did what the misconception does, in every case; of two that explain, one that explains
-    strictly less is left out.
+    strictly less is left out. If none explains everything, those that explain all wrong values are named.
 
     Args:
       exercise: the frozen cases.
@@ -115,14 +115,24 @@ def _gradients_agree(seen: Observation, target: Observation, case: FrozenCase) -
 
 
 def _explanations(exercise: FrozenExercise, pairs: list[tuple[FrozenCase, Observation]], failed: list[str]) -> list[str]:
+    """What explains all that was seen or, failing that, all wrong values: a leaking gradient beside them can wait."""
+    named = _explaining(exercise, pairs, failed, set(FACET_TEXT))
+    return named or ("values" in failed and _explaining(exercise, pairs, failed, {"values"})) or []
+
+
+def _explaining(
+    exercise: FrozenExercise, pairs: list[tuple[FrozenCase, Observation]], failed: list[str], considered: set[str]
+) -> list[str]:
     explained: dict[str, set[str]] = {}
     for name in exercise.messages:
         signature: set[str] = set()
         unlike: set[str] = set()
         for case, seen in pairs:
             shown = case.misconceptions[name]
-            signature |= min((differing_facets(shown, right, case) for right in case.expected), key=len)
+            signature |= considered & min((differing_facets(shown, right, case) for right in case.expected), key=len)
             unlike |= differing_facets(seen, shown, case)
+            if signature & unlike or not signature <= set(failed):  # no later case can mend that
+                break
         explains_values = "values" in signature or "values" not in failed  # else it would name a scratch on a wreck
         if signature and signature <= set(failed) and not signature & unlike and explains_values:
             explained[name] = signature
