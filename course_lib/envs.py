@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import gymnasium as gym
 import numpy as np
+import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
@@ -119,3 +122,91 @@ class ChainVectorEnv(gym.vector.VectorEnv):
         """The exact Q(s, a) = r(s, a) + γ Σ P(s' | s, a) V(s'): (length, 2) float64; arguments as for `values`."""
         transitions, rewards = self.model()
         return (rewards + gamma * transitions @ self.values(right_probability, gamma)).T
+
+
+class BalanceTask:
+    """A point that drifts away from zero, and a controller that pushes it back. Everything about it is known exactly.
+
+        s' = drift * s + a + noise * w,   a ~ N(-obs @ gains, std²),   reward exp(-s'² / 2),   s_0 ~ N(0, start_std²)
+
+    with w standard normal: the reward is 1 at zero and vanishes far from it. `obs` holds the position s and the readings of
+    `sensors` useless sensors, standard normal and fresh at every step. A policy is a pair of `gains`, a (1 + sensors,) tensor, and `std`.
+    Whatever it makes of the sensors acts like more noise, so every state is normal, and expected rewards have closed forms.
+
+    Args:
+      sensors: number of useless sensors.
+      drift: factor by which the distance to zero grows in a step without a push.
+      noise: standard deviation of the disturbance in a step.
+      start_std: standard deviation of the first state.
+      gamma: discount per step, in (0, 1); sums over time stop where it has fallen below 1e-5.
+
+    Raises: ValueError if gamma lies outside (0, 1).
+    """
+
+    def __init__(self, sensors=0, drift=1.1, noise=0.3, start_std=2.0, gamma=0.9):
+        if not 0 < gamma < 1:
+            raise ValueError(f"gamma must lie in (0, 1), got {gamma}")
+        self.sensors, self.drift, self.noise, self.start_std, self.gamma = sensors, drift, noise, start_std, gamma
+        steps = math.ceil(math.log(1e-5) / math.log(gamma))
+        self.times = torch.arange(steps, dtype=torch.float64)
+
+    def sample(self, gains, std, count, generator):
+        """Draw steps as the policy takes them: one t steps after the start has the weight (1 - γ) γ^t.
+
+        Returns: obs (count, 1 + sensors), actions (count,), float32.
+        """
+        steps = torch.multinomial(self.gamma**self.times, count, replacement=True, generator=generator)
+        deviations = self._state_variances(gains, std).sqrt().float()[steps]
+        positions = deviations * torch.randn(count, generator=generator)
+        readings = torch.randn(count, self.sensors, generator=generator)
+        obs = torch.cat([positions.unsqueeze(-1), readings], dim=-1)
+        return obs, std * torch.randn(count, generator=generator) - obs @ gains
+
+    def mean_reward(self, gains, std):
+        """J = (1 - γ) E Σ γ^t r_t, the policy's exact discounted return on the scale of one reward: a float in [0, 1]."""
+        landing = self._landing_variances(gains, std, self._state_variances(gains, std))[0]
+        return (1 - self.gamma) * self._rewards_from(0.0, landing, gains, std).item()
+
+    def advantages(self, obs, actions, gains, std):
+        """The exact A(s, a) = Q(s, a) - V(s) of the policy, in units of reward: (B,), for obs (B, 1 + sensors), actions (B,)."""
+        drifted = self.drift * obs[:, 0]
+        action_values = self._rewards_from(drifted + actions, self.noise**2, gains, std)
+        values = self._rewards_from(drifted - obs @ gains, self.noise**2 + std**2, gains, std)
+        return (action_values - values).to(obs.dtype)
+
+    def expected_advantage(self, new_gains, new_std, gains, std):
+        """E A(s, a) over the states that (gains, std) visits and the actions of another policy there: a float.
+
+        A is the advantage of (gains, std). Kakade and Langford (2002), section 4: J(new) - J is the same over the new one's states.
+        """
+        states = self._state_variances(gains, std)
+        weights = (1 - self.gamma) * self.gamma**self.times
+        landings = (self._landing_variances(*policy, states) for policy in ((new_gains, new_std), (gains, std)))
+        after_new, after_old = (self._rewards_from(0.0, landing, gains, std) @ weights for landing in landings)
+        return (after_new - after_old).item()
+
+    def _landing_variances(self, gains, std, state_variances):
+        """The variance of the position after one step from a state N(0, variance)."""
+        gains = torch.as_tensor(gains, dtype=torch.float64)
+        return (self.drift - gains[0]) ** 2 * state_variances + gains[1:].square().sum() + std**2 + self.noise**2
+
+    def _spread(self, gains, std):
+        """What t = 0, 1, … steps do to a position: its mean is multiplied by factors[t], and spreads[t] is added to its variance."""
+        factors = ((self.drift - float(gains[0])) ** self.times).clamp(-1e60, 1e60)  # beyond all reward, short of overflow
+        added = self._landing_variances(gains, std, 0.0) * factors**2
+        return factors, torch.cat([added.new_zeros(1), added.cumsum(0)[:-1]])
+
+    def _state_variances(self, gains, std):
+        """The variance of the position after t = 0, 1, … steps."""
+        factors, spreads = self._spread(gains, std)
+        return factors**2 * self.start_std**2 + spreads
+
+    def _rewards_from(self, mean, variance, gains, std):
+        """The expected discounted sum of rewards from a first landing place N(mean, variance) on, itself included.
+
+        E exp(-s²/2) = exp(-μ² / (2 (1 + v))) / √(1 + v) for s ~ N(μ, v).
+        """
+        mean, variance = (torch.as_tensor(given, dtype=torch.float64).unsqueeze(-1) for given in (mean, variance))
+        factors, spreads = self._spread(gains, std)
+        variances = 1 + factors**2 * variance + spreads
+        return ((-((mean * factors) ** 2) / (2 * variances)).exp() / variances.sqrt()) @ self.gamma**self.times
