@@ -163,6 +163,7 @@ class _Run:
         self._cells = runnable(self.submission.notebook, self.release)
         self._loading_failures: dict[str, str] = {}
         self._reserved = 0
+        self._apart = False  # each exercise in a sandbox of its own, with the cells up to its definition and none after it
         self._deadline = time.monotonic() + (len(self.release.exercises) + 1) * self.timeout + SLACK_SECONDS
         found: dict[str, Finding] = {}
         pending = list(self.release.exercises)
@@ -179,7 +180,13 @@ class _Run:
                         found[exercise.name] = self._timed_out(exercise)
                         break
                     except (SandboxError, ValueError) as error:
+                        if isinstance(error, SandboxDied) and self._may_be_a_later_cells_doing(exercise):
+                            self._apart = True
+                            pending.insert(0, exercise)
+                            break
                         found[exercise.name] = _failed(exercise, "error", f"The call ended the process: {error}.")
+                        break
+                    if self._apart:
                         break
         return [found.get(exercise.name) or self._timed_out(exercise) for exercise in self.release.exercises]
 
@@ -191,12 +198,20 @@ class _Run:
         except (SandboxTimeout, SandboxDied, SandboxGarbage, ValueError) as error:
             raise WorkerFailed(f"the worker did not start: {error}") from error
 
+    def _may_be_a_later_cells_doing(self, exercise: FrozenExercise) -> bool:
+        """Whether a process that was lost in a call may be lost to what a cell after the definition left running in it."""
+        return not self._apart and 0 <= _last_definition(exercise.name, self._cells) < len(self._cells) - 1
+
+    def _cells_for(self, exercise: FrozenExercise) -> list[tuple[int, str]]:
+        defined = _last_definition(exercise.name, self._cells)
+        return self._cells[: defined + 1] if self._apart and defined >= 0 else self._cells
+
     def _load(self, sandbox: Sandbox, pending: list[FrozenExercise]) -> bool:
         """Run the learner's cells. If one hangs or ends the process, drop it, so that the next attempt goes round it."""
         running = None
         until = time.monotonic() + self._loading_time(pending)
         try:
-            sandbox.send(encode({"cells": self._cells}), self._left(until))
+            sandbox.send(encode({"cells": self._cells_for(pending[0])}), self._left(until))
             while time.monotonic() < until:
                 told = _told(sandbox, self._left(until))
                 if "loaded" in told:

@@ -32,6 +32,9 @@ from course_lib.notebook import new_namespace, run_cell  # noqa: E402
 from course_lib.runner import observe  # noqa: E402
 
 
+ANSWERED = 77  # a child's exit status when it has sent its answer; 0 would be anybody's os._exit(0)
+
+
 class Channel:
     """Frames over a stream socket: eight bytes of length, then that many bytes."""
 
@@ -81,14 +84,14 @@ def answer(channel: Channel, request: dict, namespace: dict) -> None:
 
 
 def wait(child: int, seconds: float) -> str:
-    """Wait for a child; kill it after `seconds`. Returns "" if it ended well, "timeout" or "exit"."""
+    """Wait for a child; kill it after `seconds`. Returns "" if it has answered, "timeout" or "exit"."""
     handle = os.pidfd_open(child)
     in_time = select.select([handle], [], [], seconds)[0]
     if not in_time:
         os.kill(child, signal.SIGKILL)
     os.close(handle)
     _, status = os.waitpid(child, 0)
-    return "timeout" if not in_time else "exit" if status else ""
+    return "timeout" if not in_time else "" if os.waitstatus_to_exitcode(status) == ANSWERED else "exit"
 
 
 def call(channel: Channel, request: dict, namespace: dict) -> None:
@@ -102,7 +105,7 @@ def call(channel: Channel, request: dict, namespace: dict) -> None:
             channel.send({"observations": seen})
         else:
             channel.send({"missing": True})
-        status = 0
+        status = ANSWERED
     finally:
         os._exit(status)
 

@@ -30,7 +30,7 @@ class Scripted:
 
 def run(cells=((1, "def f(): ..."),), timeout=0.3):
     run = judge._Run(None, RELEASE, timeout, False)
-    run._cells, run._loading_failures, run._reserved = list(cells), {}, 0
+    run._cells, run._loading_failures, run._reserved, run._apart = list(cells), {}, 0, False
     run._deadline = time.monotonic() + 2 * timeout
     return run
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from nbformat import NotebookNode
 
-from tests.attacks.toolbox import answer, last, write
+from tests.attacks.toolbox import ARGUMENTS, answer, last, write
 
 
 def make(folder: Path, notebook: NotebookNode) -> None:

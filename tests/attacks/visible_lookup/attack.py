@@ -7,7 +7,7 @@ from nbformat import NotebookNode
 
 from autograder import checks, freeze
 from course_lib.cases import save
-from tests.attacks.toolbox import answer, first, write
+from tests.attacks.toolbox import ARGUMENTS, answer, first, write
 
 SOURCE = """
 import numpy as np, torch
