@@ -75,16 +75,19 @@ def grade(
 
 
 def judge_folder(student: str, assignment: str, folder: Path, timeout: float, trusted: bool = False) -> tuple[Verdict, NotebookNode | None]:
-    """Judge one submission, wherever this runs; our own failures become infra_error after a second attempt."""
-    submission = intake.read(student, assignment, folder)
+    """Judge one submission, wherever this runs; our own failures become infra_error after a second attempt.
+
+    Any exception is ours, and must not cost the others their grades.
+    """
     if assignment not in {page.assignment for page in chapter.all_chapters()}:
-        return judge.unknown_assignment(submission), None
+        return judge.unknown_assignment(intake.Submission(student, assignment, folder)), None
+    submission = intake.read(student, assignment, folder)
     release = judge.released(assignment)
     failure: Exception | None = None
     for _ in range(ATTEMPTS):
         try:
             return judge.judge(submission, release, timeout, trusted), submission.notebook
-        except (sandbox.SandboxUnavailable, judge.WorkerFailed, OSError) as error:
+        except Exception as error:
             failure = error
     return _infra_error(submission, release, failure), submission.notebook
 
