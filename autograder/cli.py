@@ -78,8 +78,7 @@ def hub(folder: Annotated[Path, typer.Argument(help="A new or existing folder fo
 def check(notebook: Annotated[Path, typer.Argument(help="A student notebook.")]) -> None:
     """Run the visible checks of one notebook, in this process: for your own code."""
     from autograder import checks, freeze
-    from course_lib import check as command
-    from course_lib import checking
+    from course_lib import checking, command
 
     freeze.write(checks.all_exercises(), checking.FROZEN)
     raise typer.Exit(command.main([str(notebook)]))

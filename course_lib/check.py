@@ -1,52 +1,8 @@
-"""`python -m course_lib.check NOTEBOOK.ipynb`: run the visible checks of a notebook.
+"""`python -m course_lib.check NOTEBOOK.ipynb`. Only run, never imported: `course_lib.check` is the function of that name."""
 
-Exit status: 0 all pass, 1 some do not, 2 bad input.
-"""
-
-from __future__ import annotations
-
-import os
 import sys
-from pathlib import Path
 
-from course_lib.checking import check, exercise_names
-from course_lib.notebook import NotebookError, code_cells, new_namespace, run_cells
-
-
-def main(arguments: list[str]) -> int:
-    """Check every exercise whose check cell is in the notebook."""
-    if len(arguments) != 1:
-        print("usage: python -m course_lib.check NOTEBOOK.ipynb", file=sys.stderr)
-        return 2
-    path = Path(arguments[0])
-    try:
-        cells = code_cells(path)
-    except NotebookError as error:
-        print(error, file=sys.stderr)
-        return 2
-    wanted = [name for name in exercise_names() if any(f"check({name})" in cell["source"] for cell in cells)]
-    wanted.sort(key=lambda name: next(i for i, cell in enumerate(cells) if f"check({name})" in cell["source"]))
-    if not wanted:
-        print(f"{path}: no cell of this notebook checks an exercise of the course", file=sys.stderr)
-        return 2
-    os.chdir(path.resolve().parent)  # files beside the notebook are found as Jupyter finds them
-    os.environ.setdefault("MPLBACKEND", "Agg")
-    namespace = new_namespace()
-    failures = run_cells(cells, namespace)
-    for position, error in failures.items():
-        print(f"! code cell {position + 1} stopped: {type(error).__name__}: {error}")
-    passed = 0
-    for name in wanted:
-        if not callable(namespace.get(name)):
-            print(f"✗ {name}: the notebook defines no function of this name")
-            continue
-        result = check(namespace[name])
-        print(result)
-        passed += result.passed
-    print(f"{passed} of {len(wanted)} pass")
-    return 0 if passed == len(wanted) else 1
-
+from course_lib.command import main
 
 if __name__ == "__main__":
-    sys.path.insert(0, "")
     sys.exit(main(sys.argv[1:]))

@@ -122,7 +122,7 @@ def notebook(tmp_path, *sources):
 
 
 def command(path, frozen):
-    code = f"import sys, pathlib\nfrom course_lib import checking\nchecking.FROZEN = pathlib.Path({str(frozen)!r})\nfrom course_lib.check import main\nsys.exit(main(sys.argv[1:]))"
+    code = f"import sys, pathlib\nfrom course_lib import checking\nchecking.FROZEN = pathlib.Path({str(frozen)!r})\nfrom course_lib.command import main\nsys.exit(main(sys.argv[1:]))"
     return subprocess.run([sys.executable, "-c", code, *path], capture_output=True, text=True)
 
 
