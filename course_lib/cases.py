@@ -67,7 +67,8 @@ class FrozenCase:
 
 @dataclass
 class FrozenExercise:
-    """All cases of one exercise. `criteria` maps facets to points, `messages` misconceptions to what the learner reads.
+    """All cases of one exercise. `criteria` maps facets to points, `messages` misconceptions to what the learner reads, and
+    `signatures` misconceptions to the facets in which they differ from what is right.
 
     `axes` names the axes of the outputs; `last_step_first` is set where errors travel backwards in time, so that the latest wrong
     step is the one to look at.
@@ -76,6 +77,7 @@ class FrozenExercise:
     name: str
     criteria: dict[str, float]
     messages: dict[str, str]
+    signatures: dict[str, list[str]]
     cases: list[FrozenCase]
     axes: list[str] = field(default_factory=list)
     last_step_first: bool = False

@@ -100,8 +100,13 @@ def _close(seen: np.ndarray, target: np.ndarray, case: FrozenCase) -> np.ndarray
         return np.isclose(seen, target, rtol=rtol, atol=atol, equal_nan=True)
 
 
+def signature(name: str, cases: Sequence[FrozenCase]) -> list[str]:
+    """The facets in which a misconception differs from what is right, over all cases."""
+    return sorted(set().union(*(_differs_from_expected(case, case.misconceptions[name]) for case in cases)))
+
+
 def _values_agree(seen: np.ndarray, target: np.ndarray, case: FrozenCase) -> bool:
-    return seen.shape == target.shape and bool(_close(seen, target, case).all())
+    return seen.shape == target.shape and (np.array_equal(seen, target) or bool(_close(seen, target, case).all()))
 
 
 def _gradients_agree(seen: Observation, target: Observation, case: FrozenCase) -> bool:
@@ -115,17 +120,14 @@ def _gradients_agree(seen: Observation, target: Observation, case: FrozenCase) -
 
 
 def _explanations(exercise: FrozenExercise, pairs: list[tuple[FrozenCase, Observation]], failed: list[str]) -> list[str]:
-    explained: dict[str, set[str]] = {}
-    for name in exercise.messages:
-        signature: set[str] = set()
-        unlike: set[str] = set()
-        for case, seen in pairs:
-            shown = case.misconceptions[name]
-            signature |= min((differing_facets(shown, right, case) for right in case.expected), key=len)
-            unlike |= differing_facets(seen, shown, case)
-        explains_values = "values" in signature or "values" not in failed  # else it would name a scratch on a wreck
-        if signature and signature <= set(failed) and not signature & unlike and explains_values:
-            explained[name] = signature
+    def explains(name: str, signature: set[str]) -> bool:
+        if not signature or not signature <= set(failed):
+            return False
+        if "values" in failed and "values" not in signature:  # it would name a scratch on a wreck
+            return False
+        return not any(signature & differing_facets(seen, case.misconceptions[name], case) for case, seen in pairs)
+
+    explained = {name: set(facets) for name, facets in exercise.signatures.items() if explains(name, set(facets))}
     return [name for name, facets in explained.items() if not any(facets < others for others in explained.values())]
 
 
