@@ -35,7 +35,7 @@ def diagnose(exercise: FrozenExercise, observations: Sequence[Observation]) -> F
 
     Points are paid by facet, and only together with right values. A misconception is named if, in every facet in which it differs
     from the reference, the function did what the misconception does, in every case; of two that explain, one that explains
-    strictly less is left out.
+    strictly less is left out. If none explains everything, those that explain all wrong values are named.
 
     Args:
       exercise: the frozen cases.
@@ -120,14 +120,24 @@ def _gradients_agree(seen: Observation, target: Observation, case: FrozenCase) -
 
 
 def _explanations(exercise: FrozenExercise, pairs: list[tuple[FrozenCase, Observation]], failed: list[str]) -> list[str]:
-    def explains(name: str, signature: set[str]) -> bool:
-        if not signature or not signature <= set(failed):
-            return False
-        if "values" in failed and "values" not in signature:  # it would name a scratch on a wreck
-            return False
-        return not any(signature & differing_facets(seen, case.misconceptions[name], case) for case, seen in pairs)
+    """What explains all that was seen or, failing that, all wrong values: a leaking gradient beside them can wait."""
+    if "values" not in failed:
+        return _explaining(exercise, pairs, failed, set(FACET_TEXT))
+    return _explaining(exercise, pairs, failed, set(FACET_TEXT), "values") or _explaining(exercise, pairs, failed, {"values"}, "values")
 
-    explained = {name: set(facets) for name, facets in exercise.signatures.items() if explains(name, set(facets))}
+
+def _explaining(
+    exercise: FrozenExercise, pairs: list[tuple[FrozenCase, Observation]], failed: list[str], considered: set[str], foremost: str = ""
+) -> list[str]:
+    """The misconceptions whose `considered` facets were all seen as they would show them. With wrong values, one that is about something
+    else only would name a scratch on a wreck: `foremost` must be among the facets."""
+
+    def explains(name: str, facets: set[str]) -> bool:
+        if not facets or not facets <= set(failed) or (foremost and foremost not in facets):
+            return False
+        return not any(facets & differing_facets(seen, case.misconceptions[name], case) for case, seen in pairs)
+
+    explained = {name: considered & set(facets) for name, facets in exercise.signatures.items() if explains(name, considered & set(facets))}
     return [name for name, facets in explained.items() if not any(facets < others for others in explained.values())]
 
 

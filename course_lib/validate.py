@@ -27,3 +27,15 @@ def unit_interval(**scalars: float) -> None:
     for name, value in scalars.items():
         if not 0 <= value <= 1:
             raise ValueError(f"{name} must lie in [0, 1], got {value}")
+
+
+def non_negative(**scalars: float) -> None:
+    """Raise ValueError unless every scalar is at least 0; infinity is.
+
+    >>> non_negative(clip_range=-0.1)
+    Traceback (most recent call last):
+    ValueError: clip_range must be at least 0, got -0.1
+    """
+    for name, value in scalars.items():
+        if not value >= 0:
+            raise ValueError(f"{name} must be at least 0, got {value}")

@@ -81,6 +81,10 @@ def test_all_misconceptions_that_explain_are_named():
     assert finding(lambda x, ended, gamma=0.5: x * 2).misconceptions == ["end-ignored", "end-ignored-again"]
 
 
+def test_wrong_values_are_named_even_if_the_gradient_is_wrong_in_a_way_of_its_own():
+    assert finding(lambda x, ended, gamma=0.5: 2 * x.detach()).misconceptions == ["end-ignored", "end-ignored-again"]
+
+
 def test_nobody_is_accused_falsely():
     assert finding(lambda x, ended, gamma=0.5: double(x, ended, gamma) * 1.01).misconceptions == []
     assert finding(lambda x, ended, gamma=0.5: None).misconceptions == []
