@@ -142,5 +142,7 @@ def test_absent_students_and_scores_by_hand_are_kept(submitted, undisturbed, tmp
     verdicts, grades, questions, _ = results(out)
     assert {name: verdicts[name] for name in ("bob", "eve")} == {name: before[0][name] for name in ("bob", "eve")}
     assert verdicts["ann"]["manual_score"] == 2.5 and verdicts["ann"]["score"] == 10
-    assert [row for row in grades.splitlines() if ",ann," not in row] == [row for row in before[1].splitlines() if ",ann," not in row]
+    assert [row for row in grades.splitlines() if ",ann," not in row] == [
+        row for row in before[1].splitlines() if ",ann," not in row
+    ]
     assert any(",ann," in row and ",12.5," in row for row in grades.splitlines()) and questions == before[2]
