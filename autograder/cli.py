@@ -98,6 +98,8 @@ def grade(
     ] = False,
 ) -> None:
     """Grade all submissions in a folder. Exit status: 0 all have a verdict, 1 below --fail-under, 2 bad input, 3 the grader failed."""
+    from sqlalchemy.exc import SQLAlchemyError
+
     from autograder import exports, grade, sandbox
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -111,6 +113,9 @@ def grade(
         except (grade.GradingError, sandbox.SandboxUnavailable) as error:
             bar.stop()
             _stop(error)
+        except (OSError, SQLAlchemyError) as error:  # a full disk, most likely; Python's own exit status would mean low scores
+            bar.stop()
+            _stop(f"the grades cannot be written: {error}. What is written is whole; mend this and grade again.", BROKEN)
     Console(highlight=False).print(exports.table(results))
     print(f"Grades are in {out}")
     if any(verdict.status == "infra_error" for verdict in results):

@@ -1,7 +1,7 @@
 """All attacks, in one class with two honest students, graded once by the real command; then each attack's verdict is looked at.
 
 `NAME/attack.py` says what is tried and why it must fail, and its `make(folder, notebook)` writes the submission, given the perfect
-notebook; `NAME/expected.json` holds what the contract demands. `ATTACK=NAME pytest tests/attacks` runs one of them alone.
+notebook; `NAME/expected.json` holds what the contract demands. `ATTACK=NAME,NAME pytest tests/attacks` runs those alone.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 TIMEOUT = 4
 HONEST = ("honest-1", "honest-2")
 NAMES = sorted(path.parent.name for path in Path(__file__).parent.glob("*/attack.py"))
-NAMES = [name for name in NAMES if os.environ.get("ATTACK", name) == name]
+NAMES = [name for name in NAMES if name in os.environ.get("ATTACK", name).split(",")]
 
 
 def student(name):
@@ -41,10 +41,26 @@ def outcome(tmp_path_factory):
         target = submitted / (name if name in HONEST else student(name)) / "ch44"
         target.mkdir(parents=True)
         make(target, toolbox.solved())
-    command = [sys.executable, "-m", "autograder", "grade", str(submitted), "--out", str(out), "--jobs", "2", "--timeout", str(TIMEOUT)]
+    command = [
+        sys.executable,
+        "-m",
+        "autograder",
+        "grade",
+        str(submitted),
+        "--out",
+        str(out),
+        "--jobs",
+        "2",
+        "--timeout",
+        str(TIMEOUT),
+    ]
     start = time.monotonic()
     process = subprocess.run(
-        command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT), "GRADER_SECRET": toolbox.CANARY}, capture_output=True, text=True
+        command,
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "GRADER_SECRET": toolbox.CANARY},
+        capture_output=True,
+        text=True,
     )
     print(f"\n{len(NAMES)} attacks in {time.monotonic() - start:.0f} s\n{process.stdout}{process.stderr}")
     yield process, out, submitted

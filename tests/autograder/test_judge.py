@@ -11,7 +11,9 @@ from autograder import judge
 from autograder.sandbox import SandboxTimeout
 from course_lib.cases import FrozenCase, FrozenExercise, Observation, encode
 
-EXERCISE = FrozenExercise("f", {"values": 1.0}, {}, [FrozenCase("one", {}, [Observation(kind="tensor", outputs={"": np.ones(2)})])])
+EXERCISE = FrozenExercise(
+    "f", {"values": 1.0}, {}, [FrozenCase("one", {}, [Observation(kind="tensor", outputs={"": np.ones(2)})])]
+)
 RELEASE = judge.Released("ch99", (EXERCISE,), (), frozenset(), frozenset(), "")
 
 
@@ -107,7 +109,9 @@ def test_an_answer_of_brackets_is_not_parsed():
         assert time.monotonic() - start < 0.5
 
 
-@pytest.mark.parametrize("source", ["\n" * 1_000_000, " " * 1_000_000, "async\n" * 200_000, "f " * 500_000], ids=["lines", "blanks", "async", "f"])
+@pytest.mark.parametrize(
+    "source", ["\n" * 1_000_000, " " * 1_000_000, "async\n" * 200_000, "f " * 500_000], ids=["lines", "blanks", "async", "f"]
+)
 def test_looking_for_a_definition_takes_no_longer_for_a_hostile_cell(source):
     start = time.monotonic()
     assert judge._last_definition("f", [(1, source)]) == -1

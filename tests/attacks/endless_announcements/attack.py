@@ -8,5 +8,5 @@ from tests.attacks.toolbox import CHANNEL, last, write
 
 
 def make(folder: Path, notebook: NotebookNode) -> None:
-    last(notebook, CHANNEL + 'while True:\n    channel.send({"running": 1})')
+    last(notebook, CHANNEL + 'while True:\n    channel.send({"running": 10**9})')
     write(folder, notebook)

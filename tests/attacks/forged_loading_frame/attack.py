@@ -10,7 +10,7 @@ from tests.attacks.toolbox import CHANNEL, last, write, wrong
 SOURCE = """
 channel.send({"loaded": {}})
 for _ in range(6):
-    channel.send({"score": 2.0, "state": "correct", "observations": [{}]})
+    channel.send({"score": 2.0, "state": "correct", "passed": True})
 """
 
 

@@ -13,8 +13,16 @@ SCRIPT = "</script><script>evil()</script>"
 
 def make(folder: Path, notebook: NotebookNode) -> None:
     notebook.metadata.update(
-        kernelspec={"name": "../../evil; touch /tmp/evil", "display_name": SCRIPT, "language": "sh", "argv": ["sh", "-c", "touch /tmp/evil"]},
-        language_info={"name": SCRIPT, "file_extension": "/../x"}, trusted=True, signature="sha256:0", title=SCRIPT,
+        kernelspec={
+            "name": "../../evil; touch /tmp/evil",
+            "display_name": SCRIPT,
+            "language": "sh",
+            "argv": ["sh", "-c", "touch /tmp/evil"],
+        },
+        language_info={"name": SCRIPT, "file_extension": "/../x"},
+        trusted=True,
+        signature="sha256:0",
+        title=SCRIPT,
     )
     for one in notebook.cells:
         if one.cell_type == "code":

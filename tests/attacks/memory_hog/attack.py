@@ -14,8 +14,7 @@ for _ in range(6):
         break
 while True:
     try:
-        kept.append(bytearray(32 << 20))
-        kept[-1][::4096] = b"x" * len(kept[-1][::4096])
+        kept.append(b"x" * (256 << 20))
     except MemoryError:
         pass
 """

@@ -1,4 +1,4 @@
-"""Returns a hundred megabytes for each case: more than a frame may have."""
+"""Returns more than seventy megabytes: more than a frame may have."""
 
 from pathlib import Path
 
@@ -7,11 +7,16 @@ from nbformat import NotebookNode
 from tests.attacks.toolbox import write, wrong
 
 BODY = """
-big = torch.zeros(100 << 17, dtype=torch.float64)
-return big, big
+if not calls:
+    calls.append(1)
+    return torch.zeros(9 << 20), torch.zeros(9 << 20)
+"""
+
+ABOVE = """
+calls = []
 """
 
 
 def make(folder: Path, notebook: NotebookNode) -> None:
-    wrong(notebook, BODY)
+    wrong(notebook, BODY, ABOVE)
     write(folder, notebook)

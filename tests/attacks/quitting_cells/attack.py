@@ -6,7 +6,13 @@ from nbformat import NotebookNode
 
 from tests.attacks.toolbox import last, write
 
-SOURCES = ["import sys\nsys.exit(0)", "raise KeyboardInterrupt", "raise SystemExit('all tests passed')", "raise StopIteration", "quit()"]
+SOURCES = [
+    "import sys\nsys.exit(0)",
+    "raise KeyboardInterrupt",
+    "raise SystemExit('all tests passed')",
+    "raise StopIteration",
+    "quit()",
+]
 
 
 def make(folder: Path, notebook: NotebookNode) -> None:

@@ -11,7 +11,17 @@ EXIT = "import os\nos._exit(0)\n"
 
 
 def make(folder: Path, notebook: NotebookNode) -> None:
-    for name in ("torch", "numpy", "json", "course_lib", "safetensors", "sitecustomize", "usercustomize", "select", "dataclasses"):
+    for name in (
+        "torch",
+        "numpy",
+        "json",
+        "course_lib",
+        "safetensors",
+        "sitecustomize",
+        "usercustomize",
+        "select",
+        "dataclasses",
+    ):
         (folder / f"{name}.py").write_text(EXIT)
         (folder / name).mkdir()
         (folder / name / "__init__.py").write_text(EXIT)

@@ -10,6 +10,9 @@ from tests.attacks.toolbox import write, wrong
 BODY = """
 import gc, sys
 import numpy as np
+if searched:
+    return searched[0], searched[0]
+searched.append(torch.zeros_like(rewards))
 given = [value.detach().numpy() for value in (rewards, values, next_values)]
 found, frame = [], sys._getframe()
 while frame:
@@ -26,7 +29,11 @@ if len(arrays) > 1:
     return torch.from_numpy(arrays[-1].copy()), torch.from_numpy(arrays[-2].copy())
 """
 
+ABOVE = """
+searched = []
+"""
+
 
 def make(folder: Path, notebook: NotebookNode) -> None:
-    wrong(notebook, BODY)
+    wrong(notebook, BODY, ABOVE)
     write(folder, notebook)
