@@ -60,7 +60,8 @@ def verify(chapter: Chapter, sources: Sources | None = None) -> None:
 def book_view(chapter: Chapter, outputs: Outputs, with_solutions: bool = True, sources: Sources | None = None) -> NotebookNode:
     """The page as MyST for Jupyter Book (`execute_notebooks: "off"`): stubs, executed outputs, folded references.
 
-    Nothing of a reference is in it if not with_solutions, nor the source of book-only cells, which may hold answers. Pages of one book must lie in one folder, as CHAPTER.page + ".ipynb".
+    Nothing of a reference is in it if not with_solutions, nor the source of book-only cells, which may hold answers.
+    Pages of one book must lie in one folder, as CHAPTER.page + ".ipynb".
     """
     sources = sources or real_sources(chapter)
     solutions = references(chapter, sources)
@@ -73,7 +74,9 @@ def book_view(chapter: Chapter, outputs: Outputs, with_solutions: bool = True, s
             yield _markdown(f"{key}-reference", _folded(solutions[str(cell.exercise)]))
 
     def code(key: str, cell: Cell) -> NotebookNode:
-        source = cell.source if with_solutions or "book-only" not in cell.tags else "# The edition with solutions shows this cell."
+        source = (
+            cell.source if with_solutions or "book-only" not in cell.tags else "# The edition with solutions shows this cell."
+        )
         node = _code(key, source, cell.tags - {"live", "book-only"}, executed[key])
         if cell.alt:
             node.metadata["mystnb"] = {"image": {"alt": cell.alt}}

@@ -98,7 +98,9 @@ def parse(content: bytes) -> nbformat.NotebookNode:
             document = nbformat.convert(nbformat.from_dict(document), 4)
         if len(document["cells"]) > MAX_CELLS:
             raise BadNotebook(f"The notebook has {len(document['cells'])} cells; at most {MAX_CELLS} are graded.")
-        return nbformat.from_dict({"nbformat": 4, "nbformat_minor": 5, "metadata": {}, "cells": [_cell(c) for c in document["cells"]]})
+        return nbformat.from_dict(
+            {"nbformat": 4, "nbformat_minor": 5, "metadata": {}, "cells": [_cell(c) for c in document["cells"]]}
+        )
     except BadNotebook:
         raise
     except UnicodeDecodeError:
@@ -158,7 +160,9 @@ def _collect(folder: Path, submission: Submission) -> None:
             continue
         total += size
         if len(submission.files) >= MAX_SIDE_FILES or total > MAX_SIDE_BYTES:
-            submission.flags.append(f"ignored_files: more than {MAX_SIDE_FILES} files or {MAX_SIDE_BYTES >> 20} MB beside the notebook")
+            submission.flags.append(
+                f"ignored_files: more than {MAX_SIDE_FILES} files or {MAX_SIDE_BYTES >> 20} MB beside the notebook"
+            )
             return
         submission.files[relative] = Path(entry.path)
 

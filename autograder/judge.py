@@ -21,7 +21,7 @@ import numpy as np
 import course_lib
 from autograder import assemble, chapter, checks, freeze, intake
 from autograder.paths import ROOT
-from autograder.sandbox import Sandbox, SandboxDied, SandboxError, SandboxGarbage, SandboxTimeout, SandboxUnavailable
+from autograder.sandbox import Sandbox, SandboxDied, SandboxError, SandboxGarbage, SandboxTimeout
 from autograder.verdicts import Item, Verdict, clean_text
 from course_lib.cases import FrozenExercise, Observation, decode, encode
 from course_lib.diagnosis import Finding, diagnose
@@ -61,14 +61,18 @@ def released(assignment: str) -> Released:
     tests = {f"test_{name}" for name in names}
     questions = {name for name, _ in outline.open_questions}
     live = frozenset(_squeezed(cell.source) for cell in page.cells if cell.kind == "code" and "live" in cell.tags)
-    return Released(assignment, exercises, tuple(outline.open_questions), frozenset(names | tests | questions), live, environment())
+    return Released(
+        assignment, exercises, tuple(outline.open_questions), frozenset(names | tests | questions), live, environment()
+    )
 
 
 @functools.cache
 def environment() -> str:
     """sha256 of the pins, the checks, the references and the code that judges: what a score depends on beside the submission."""
     folders = ("autograder", "solutions", "course_lib")
-    files = [ROOT / "requirements.txt", ROOT / "constraints.txt"] + [p for folder in folders for p in (ROOT / folder).rglob("*.py")]
+    files = [ROOT / "requirements.txt", ROOT / "constraints.txt"] + [
+        p for folder in folders for p in (ROOT / folder).rglob("*.py")
+    ]
     digest = hashlib.sha256()
     for path in sorted(files):
         digest.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes() + b"\0")
@@ -101,9 +105,7 @@ def judge(submission: intake.Submission, release: Released, timeout: float = 60.
         findings = run.findings()
         flags += run.flags
         status = "needs_review" if tampered else "graded"
-    items = [
-        Item(f.exercise, f.score, f.max_score, f.state, tuple(f.misconceptions), clean_text(f.message)) for f in findings
-    ]
+    items = [Item(f.exercise, f.score, f.max_score, f.state, tuple(f.misconceptions), clean_text(f.message)) for f in findings]
     items += [Item(name, 0.0, points, "manual") for name, points in release.open_questions]
     return Verdict.of(
         Verdict(
@@ -124,7 +126,9 @@ def judge(submission: intake.Submission, release: Released, timeout: float = 60.
 def unknown_assignment(submission: intake.Submission) -> Verdict:
     """The verdict on a folder whose name is no assignment of the course."""
     flags = ("unknown_assignment", *submission.flags)
-    return Verdict.of(Verdict(submission.student, submission.assignment, "student_error", 0.0, 0.0, flags=flags, environment=environment()))
+    return Verdict.of(
+        Verdict(submission.student, submission.assignment, "student_error", 0.0, 0.0, flags=flags, environment=environment())
+    )
 
 
 def tampering(notebook: Any, release: Released) -> list[str]:
@@ -340,7 +344,7 @@ def _consistent(seen: Observation) -> bool:
     """Whether the outputs are those that the kind promises: what compares them goes by the kind."""
     if seen.outputs:
         return seen.kind == _kind(seen.outputs)
-    return seen.kind in ("tuple of 0", "dict of ") or seen.kind != "tensor" and " of " not in seen.kind
+    return seen.kind in ("tuple of 0", "dict of ") or (seen.kind != "tensor" and " of " not in seen.kind)
 
 
 def _list(value: Any) -> list[Any]:

@@ -53,10 +53,7 @@ def diagnose(exercise: FrozenExercise, observations: Sequence[Observation]) -> F
     paid = 0.0 if "values" in failed else sum(points for facet, points in exercise.criteria.items() if facet not in failed)
     named = _explanations(exercise, pairs, failed)
     crashed = next((seen for (_, seen), facets in zip(pairs, differing, strict=True) if "values" in facets and seen.error), None)
-    if paid:
-        state = "partial"
-    else:
-        state = "error" if crashed and not named else "wrong"
+    state = "partial" if paid else "error" if crashed and not named else "wrong"
     lines = [f"Looks like {name}: {exercise.messages[name]}" for name in named]
     lines += _descriptions(exercise, pairs, differing, failed)
     return Finding(exercise.name, state, round(paid, 4), exercise.points, named, "\n".join(lines), failed)
@@ -123,11 +120,17 @@ def _explanations(exercise: FrozenExercise, pairs: list[tuple[FrozenCase, Observ
     """What explains all that was seen or, failing that, all wrong values: a leaking gradient beside them can wait."""
     if "values" not in failed:
         return _explaining(exercise, pairs, failed, set(FACET_TEXT))
-    return _explaining(exercise, pairs, failed, set(FACET_TEXT), "values") or _explaining(exercise, pairs, failed, {"values"}, "values")
+    return _explaining(exercise, pairs, failed, set(FACET_TEXT), "values") or _explaining(
+        exercise, pairs, failed, {"values"}, "values"
+    )
 
 
 def _explaining(
-    exercise: FrozenExercise, pairs: list[tuple[FrozenCase, Observation]], failed: list[str], considered: set[str], foremost: str = ""
+    exercise: FrozenExercise,
+    pairs: list[tuple[FrozenCase, Observation]],
+    failed: list[str],
+    considered: set[str],
+    foremost: str = "",
 ) -> list[str]:
     """The misconceptions whose `considered` facets were all seen as they would show them. With wrong values, one that is about something
     else only would name a scratch on a wreck: `foremost` must be among the facets."""
@@ -137,7 +140,9 @@ def _explaining(
             return False
         return not any(facets & differing_facets(seen, case.misconceptions[name], case) for case, seen in pairs)
 
-    explained = {name: considered & set(facets) for name, facets in exercise.signatures.items() if explains(name, considered & set(facets))}
+    explained = {
+        name: considered & set(facets) for name, facets in exercise.signatures.items() if explains(name, considered & set(facets))
+    }
     return [name for name, facets in explained.items() if not any(facets < others for others in explained.values())]
 
 

@@ -105,7 +105,9 @@ def test_a_first_call_answers_within_a_second(frozen):
         f"checking.FROZEN = pathlib.Path({str(frozen)!r})\nfrom solutions.ch44 import compute_gae\ncheck(compute_gae)\n"
         "print(time.perf_counter() - start)"
     )
-    times = [float(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout) for _ in range(3)]
+    times = [
+        float(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout) for _ in range(3)
+    ]
     assert min(times) < 1, times
 
 
@@ -117,7 +119,9 @@ def test_nbgraders_validate_button_sees_a_failure(monkeypatch):
 
 def notebook(tmp_path, *sources):
     path = tmp_path / "nb.ipynb"
-    path.write_text(json.dumps({"cells": [{"cell_type": "code", "source": source, "metadata": {}} for source in sources], "nbformat": 4}))
+    path.write_text(
+        json.dumps({"cells": [{"cell_type": "code", "source": source, "metadata": {}} for source in sources], "nbformat": 4})
+    )
     return path
 
 
