@@ -66,7 +66,7 @@ def load(channel: Channel, cells: list) -> dict:
         channel.send({"running": number})
         try:
             run_cell(source, namespace, f"cell {number}")
-        except (Exception, SystemExit, KeyboardInterrupt) as error:
+        except BaseException as error:  # whatever a cell raises, the next one runs
             failures[number] = f"{type(error).__name__}: {error!s:.300}"
     channel.send({"loaded": failures})
     return namespace

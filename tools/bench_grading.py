@@ -2,8 +2,8 @@
 
     python tools/bench_grading.py [SUBMISSIONS]
 
-The submissions are solved notebooks of chapter 44 in five styles. Their live cells (training, plots) are emptied for both: `course grade` never
-runs them, and nbgrader would, for half a minute each. Both graders use the same two processors; nbgrader has no parallel mode.
+The submissions are solved notebooks of chapter 44. Their live cells (training, plots) are emptied for both: `course grade`
+never runs them, and nbgrader would, for half a minute each. Both have the same two processors; nbgrader has no parallel mode.
 """
 
 from __future__ import annotations

@@ -156,7 +156,10 @@ def _residuals_by_hand(rewards, values, next_values, terminated, truncated, gamm
 # ---------------------------------------------------------------------------------------------------------- td_residuals
 
 _TD = ("rewards", "values", "next_values")
-_DETACH = "The result still hangs on the critic's graph. Advantages are data for the losses: detach the result, or work under torch.no_grad()."
+_DETACH = (
+    "The result still hangs on the critic's graph. Advantages are data for the losses: "
+    "detach the result, or work under torch.no_grad()."
+)
 _VALIDATE = (
     "Shapes that differ broadcast silently into nonsense, and a discount outside [0, 1] diverges. "
     "Check the arguments first: course_lib.validate raises errors that name them."
@@ -323,7 +326,8 @@ TD_RESIDUALS = Exercise(
         Misconception(
             "shifted-values-as-next-values",
             _td(lambda r, v, v_next, alive, gamma: r + gamma * _shifted(v, v_next) * alive - v),
-            "values[t + 1] is the value of whatever came next in the buffer; where an episode was cut, that is another episode. Use next_values.",
+            "values[t + 1] is the value of whatever came next in the buffer; where an episode was cut, that is "
+            "another episode. Use next_values.",
         ),
         Misconception("graph-kept", _td_graph, _DETACH),
         Misconception("dtype-lost", lambda *args, **kwargs: ch44.td_residuals(*args, **kwargs).float(), _DTYPE),
@@ -561,12 +565,14 @@ COMPUTE_GAE = Exercise(
                 bootstrap=lambda terminated, truncated: torch.ones_like(terminated),
                 carry=lambda terminated, truncated: torch.ones_like(terminated),
             ),
-            "Neither the bootstrap nor the recursion looks at the episode's end: terminated removes the bootstrap, either flag stops the sum.",
+            "Neither the bootstrap nor the recursion looks at the episode's end: terminated removes the "
+            "bootstrap, either flag stops the sum.",
         ),
         Misconception(
             "ended-mask-of-the-next-step",
             _gae(carry=_next_ended),
-            "The recursion looks at the flag of step t + 1. Here a flag belongs to the step that it ends: use terminated[t] and truncated[t].",
+            "The recursion looks at the flag of step t + 1. Here a flag belongs to the step that it ends: use "
+            "terminated[t] and truncated[t].",
         ),
         Misconception(
             "lambda-missing",
@@ -581,7 +587,8 @@ COMPUTE_GAE = Exercise(
         Misconception(
             "shifted-values-as-next-values",
             _gae(following=_shifted),
-            "values[t + 1] is the value of whatever came next in the buffer; where an episode was cut, that is another episode. Use next_values.",
+            "values[t + 1] is the value of whatever came next in the buffer; where an episode was cut, that is "
+            "another episode. Use next_values.",
         ),
         Misconception(
             "residuals-only", _gae_residuals_only, "This is the one-step residual: later residuals are missing (lambda = 0)."

@@ -126,12 +126,18 @@ def notebook(tmp_path, *sources):
 
 
 def command(path, frozen):
-    code = f"import sys, pathlib\nfrom course_lib import checking\nchecking.FROZEN = pathlib.Path({str(frozen)!r})\nfrom course_lib.command import main\nsys.exit(main(sys.argv[1:]))"
+    code = (
+        "import sys, pathlib\nfrom course_lib import checking\nfrom course_lib.command import main\n"
+        f"checking.FROZEN = pathlib.Path({str(frozen)!r})\nsys.exit(main(sys.argv[1:]))"
+    )
     return subprocess.run([sys.executable, "-c", code, *path], capture_output=True, text=True)
 
 
 def test_the_command_passes_fails_and_refuses(tmp_path, frozen):
-    right = "def lambda_returns(advantages, values):\n    assert advantages.shape == values.shape or _no()\n    return (advantages + values).detach()\ndef _no():\n    raise ValueError('advantages and values differ')"
+    right = (
+        "from course_lib import validate\ndef lambda_returns(advantages, values):\n"
+        "    validate.same_shape(advantages=advantages, values=values)\n    return (advantages + values).detach()"
+    )
     wrong = "def lambda_returns(advantages, values):\n    return advantages"
     passing = command([str(notebook(tmp_path, right, "check(lambda_returns)"))], frozen)
     assert passing.returncode == 0 and "1 of 1 pass" in passing.stdout
