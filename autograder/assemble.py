@@ -27,6 +27,7 @@ from course_lib.cases import FACET_TEXT
 Outputs = Sequence[list[NotebookNode]]
 
 _LEVELS = {1: "●○○ (1 of 3)", 2: "●●○ (2 of 3)", 3: "●●● (3 of 3)"}
+_HEADING = re.compile(r"^(#{2,6}) (.+)$", re.MULTILINE)
 _ANSI = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 
 
@@ -59,7 +60,8 @@ def verify(chapter: Chapter, sources: Sources | None = None) -> None:
 def book_view(chapter: Chapter, outputs: Outputs, with_solutions: bool = True, sources: Sources | None = None) -> NotebookNode:
     """The page as MyST for Jupyter Book (`execute_notebooks: "off"`): stubs, executed outputs, folded references.
 
-    Nothing of a reference is in it if not with_solutions. Pages of one book must lie in one folder, as CHAPTER.page + ".ipynb".
+    Nothing of a reference is in it if not with_solutions, nor the source of book-only cells, which may hold answers.
+    Pages of one book must lie in one folder, as CHAPTER.page + ".ipynb".
     """
     sources = sources or real_sources(chapter)
     solutions = references(chapter, sources)
@@ -72,7 +74,10 @@ def book_view(chapter: Chapter, outputs: Outputs, with_solutions: bool = True, s
             yield _markdown(f"{key}-reference", _folded(solutions[str(cell.exercise)]))
 
     def code(key: str, cell: Cell) -> NotebookNode:
-        node = _code(key, cell.source, cell.tags - {"live", "book-only"}, executed[key])
+        source = (
+            cell.source if with_solutions or "book-only" not in cell.tags else "# The edition with solutions shows this cell."
+        )
+        node = _code(key, source, cell.tags - {"live", "book-only"}, executed[key])
         if cell.alt:
             node.metadata["mystnb"] = {"image": {"alt": cell.alt}}
         return node
@@ -143,17 +148,21 @@ def _page(
 ) -> Iterator[NotebookNode]:
     """The cells of a page in order: what the views share, with their own ways to write stubs, code and questions."""
     yield _markdown(f"{chapter.assignment}-front", _render(_front(chapter, sources), dialect, chapter, 1))
-    level, number = 2, 0
-    for key, cell in _keyed(chapter):
+    number = 0
+    for position, (key, cell) in enumerate(_keyed(chapter)):
         if cell.exercise:
-            number += 1
-            yield _markdown(f"{key}-heading", _heading(cell, level, f"{chapter.number}.{number}", sources))
+            if chapter.cells[position - 1].kind != "markdown":
+                raise _unannounced(chapter, cell)
+            yield _markdown(f"{key}-points", _criteria(cell, sources))
             yield from stub(key, cell)
         elif cell.kind == "code":
             yield code(key, cell)
         else:
             text = _render(cell.source, dialect, chapter, cell.line)
-            level = 3 if re.search(r"^##+ ", text, re.MULTILINE) else level
+            following = chapter.cells[position + 1 : position + 2]
+            if following and following[0].exercise:
+                number += 1
+                text = _introduced(text, following[0], f"{chapter.number}.{number}", chapter)
             if cell.open_question:
                 yield question(key, cell, f"**Open question** ({_points(cell.points)}, graded by a person)\n\n{text}")
             else:
@@ -179,14 +188,26 @@ def _front(chapter: Chapter, sources: Sources) -> str:
     return "\n".join(line for line in lines if line)
 
 
-def _heading(cell: Cell, level: int, number: str, sources: Sources) -> str:
+def _introduced(text: str, stub: Cell, number: str, chapter: Chapter) -> str:
+    """The text before a stub, its last heading made that of the exercise, and under it how hard and how long the exercise is."""
+    headings = list(_HEADING.finditer(text))
+    if not headings:
+        raise _unannounced(chapter, stub)
+    last = headings[-1]
+    facts = f"`{stub.exercise}` · difficulty {_LEVELS[stub.difficulty]} · {_duration(stub.minutes)}"
+    return f"{text[: last.start()]}{last[1]} Exercise {number}: {last[2]}\n\n{facts}{text[last.end() :]}"
+
+
+def _unannounced(chapter: Chapter, stub: Cell) -> ChapterError:
+    message = f"before the stub of {stub.exercise} there must be a text with a heading (### …), which becomes the exercise's"
+    return ChapterError(chapter.path, stub.line, message)
+
+
+def _criteria(cell: Cell, sources: Sources) -> str:
+    """What an exercise is worth, and for what."""
     exercise = sources.exercise(str(cell.exercise))
-    rows = "\n".join(f"| {FACET_TEXT[name]} | {points:g} |" for name, points in exercise.criteria.items())
-    return (
-        f"{'#' * level} Exercise {number}: `{cell.exercise}`\n\n"
-        f"Difficulty {_LEVELS[cell.difficulty]} · {_duration(cell.minutes)} · {_points(exercise.points)}\n\n"
-        f"| What is checked | Points |\n|:--|--:|\n{rows}"
-    )
+    shares = ", ".join(f"{points:g} if it {FACET_TEXT[name]}" for name, points in exercise.criteria.items())
+    return f"**{_points(exercise.points)}:** {shares}. Nothing is paid without right values."
 
 
 def _folded(reference: Reference) -> str:

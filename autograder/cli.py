@@ -36,7 +36,9 @@ def _recorded(page: Chapter) -> Outputs | None:
 
 @app.command()
 def book(
-    without_solutions: Annotated[bool, typer.Option("--without-solutions", help="Leave the folded reference solutions out.")] = False,
+    without_solutions: Annotated[
+        bool, typer.Option("--without-solutions", help="Leave the folded reference solutions out.")
+    ] = False,
 ) -> None:
     """Build the HTML book into book/_build/html."""
     from autograder import book as builder
@@ -68,7 +70,9 @@ def hub(folder: Annotated[Path, typer.Argument(help="A new or existing folder fo
     from autograder import release as releaser
 
     try:
-        freeze.write(checks.all_exercises(), paths.COURSE_LIB / "frozen")  # the check cells need them in the teacher's environment, too
+        freeze.write(
+            checks.all_exercises(), paths.COURSE_LIB / "frozen"
+        )  # the check cells need them in the teacher's environment, too
         print(f"nbgrader's course is at {releaser.write_nbgrader_course(folder, recorded=_recorded)}")
     except (ValueError, OSError) as error:
         _stop(error)
@@ -92,12 +96,17 @@ def grade(
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler, tcp://…, instead of --jobs.")] = None,
     timeout: Annotated[float, typer.Option(min=0.1, help="Seconds for each exercise, and for loading a notebook.")] = 60.0,
     db_url: Annotated[str | None, typer.Option(help="nbgrader's gradebook; sqlite:///OUT/gradebook.db by default.")] = None,
-    fail_under: Annotated[float | None, typer.Option(min=0.0, max=1.0, help="Exit with 1 if a submission scores less than this share.")] = None,
+    fail_under: Annotated[
+        float | None, typer.Option(min=0.0, max=1.0, help="Exit with 1 if a submission scores less than this share.")
+    ] = None,
     trust_submissions: Annotated[
-        bool, typer.Option("--trust-submissions", help="Run WITHOUT a sandbox. For your own code only: it can do all that you can.")
+        bool,
+        typer.Option("--trust-submissions", help="Run WITHOUT a sandbox. For your own code only: it can do all that you can."),
     ] = False,
 ) -> None:
     """Grade all submissions in a folder. Exit status: 0 all have a verdict, 1 below --fail-under, 2 bad input, 3 the grader failed."""
+    from sqlalchemy.exc import SQLAlchemyError
+
     from autograder import exports, grade, sandbox
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -111,6 +120,9 @@ def grade(
         except (grade.GradingError, sandbox.SandboxUnavailable) as error:
             bar.stop()
             _stop(error)
+        except (OSError, SQLAlchemyError) as error:  # a full disk, most likely; Python's own exit status would mean low scores
+            bar.stop()
+            _stop(f"the grades cannot be written: {error}. What is written is whole; mend this and grade again.", BROKEN)
     Console(highlight=False).print(exports.table(results))
     print(f"Grades are in {out}")
     if any(verdict.status == "infra_error" for verdict in results):

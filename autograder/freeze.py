@@ -14,7 +14,7 @@ import torch
 
 from autograder.spec import Case, Exercise
 from course_lib.cases import FrozenCase, FrozenExercise, save
-from course_lib.diagnosis import differing_facets
+from course_lib.diagnosis import differing_facets, signature
 from course_lib.runner import observe
 
 
@@ -46,6 +46,7 @@ def _exercise(exercise: Exercise, cases: list[FrozenCase]) -> FrozenExercise:
         name=exercise.name,
         criteria=dict(exercise.criteria),
         messages={mistake.name: mistake.message for mistake in exercise.misconceptions},
+        signatures={mistake.name: signature(mistake.name, cases) for mistake in exercise.misconceptions},
         cases=cases,
         axes=list(exercise.axes),
         last_step_first=exercise.last_step_first,

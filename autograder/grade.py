@@ -74,17 +74,22 @@ def grade(
     return sorted(results, key=lambda verdict: (verdict.student, verdict.assignment))
 
 
-def judge_folder(student: str, assignment: str, folder: Path, timeout: float, trusted: bool = False) -> tuple[Verdict, NotebookNode | None]:
-    """Judge one submission, wherever this runs; our own failures become infra_error after a second attempt."""
-    submission = intake.read(student, assignment, folder)
+def judge_folder(
+    student: str, assignment: str, folder: Path, timeout: float, trusted: bool = False
+) -> tuple[Verdict, NotebookNode | None]:
+    """Judge one submission, wherever this runs; our own failures become infra_error after a second attempt.
+
+    Any exception is ours, and must not cost the others their grades.
+    """
     if assignment not in {page.assignment for page in chapter.all_chapters()}:
-        return judge.unknown_assignment(submission), None
+        return judge.unknown_assignment(intake.Submission(student, assignment, folder)), None
+    submission = intake.read(student, assignment, folder)
     release = judge.released(assignment)
     failure: Exception | None = None
     for _ in range(ATTEMPTS):
         try:
             return judge.judge(submission, release, timeout, trusted), submission.notebook
-        except (sandbox.SandboxUnavailable, judge.WorkerFailed, OSError) as error:
+        except Exception as error:
             failure = error
     return _infra_error(submission, release, failure), submission.notebook
 
@@ -95,7 +100,15 @@ def _infra_error(submission: intake.Submission, release: judge.Released, failure
     flags = (*submission.flags, f"grader_failed: {type(failure).__name__}: {failure}")
     return Verdict.of(
         Verdict(
-            submission.student, submission.assignment, "infra_error", 0.0, total, None, manual, flags=flags, environment=release.environment
+            submission.student,
+            submission.assignment,
+            "infra_error",
+            0.0,
+            total,
+            None,
+            manual,
+            flags=flags,
+            environment=release.environment,
         )
     )
 
@@ -116,7 +129,9 @@ def _register(book: gradebook.GradebookWriter, assignment: str, released: Notebo
         raise GradingError(f"{assignment}: {error}") from None
 
 
-def _here(tasks: list[tuple[str, str, Path]], jobs: int, timeout: float, trusted: bool) -> Iterator[tuple[Verdict, NotebookNode | None]]:
+def _here(
+    tasks: list[tuple[str, str, Path]], jobs: int, timeout: float, trusted: bool
+) -> Iterator[tuple[Verdict, NotebookNode | None]]:
     # threads, for a verdict is made mostly by waiting; bubblewrap dies with the thread that started it, and these live to the end
     with ThreadPoolExecutor(jobs) as pool:
         futures = [pool.submit(judge_folder, *task, timeout, trusted) for task in tasks]
@@ -132,7 +147,11 @@ def _on_dask(tasks: list[tuple[str, str, Path]], scheduler: str, timeout: float)
 
     with Client(scheduler, timeout="30s") as client:
         futures = {
-            client.submit(judge_folder, student, assignment, folder.resolve(), timeout, pure=False, retries=1): (student, assignment, folder)
+            client.submit(judge_folder, student, assignment, folder.resolve(), timeout, pure=False, retries=1): (
+                student,
+                assignment,
+                folder,
+            )
             for student, assignment, folder in tasks
         }
         for future in as_completed(futures):

@@ -10,16 +10,21 @@ import json
 import os
 import stat
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import nbformat
 
+from autograder.verdicts import clean_text, plain_name
+
 MAX_NOTEBOOK = 20 << 20
 MAX_SIDE_FILES = 100
-MAX_NAME = 200
 MAX_SIDE_BYTES = 256 << 20
+MAX_PATH = 1000  # bytes of a side file's name with its folders
+MAX_ENTRIES = 20_000  # looked at in one submission's folder, whatever they are
+MAX_CELLS = 2000
 
 
 @dataclass
@@ -42,18 +47,19 @@ class BadNotebook(ValueError):
 def discover(submitted: Path) -> list[tuple[str, str, Path]]:
     """Every (student, assignment, folder) under `submitted`, sorted; names that begin with a dot are no submissions."""
     return [
-        (printable(student.name), printable(assignment.name), assignment)
+        (_label(student.name), _label(assignment.name), assignment)
         for student in sorted(_folders(submitted))
         for assignment in sorted(_folders(student))
     ]
 
 
-def printable(name: str) -> str:
-    """A folder's name as our own files can bear it: unprintable characters as %XX, and an overlong name cut and told apart by a hash."""
-    safe = "".join(c if c.isprintable() else "".join(f"%{byte:02X}" for byte in os.fsencode(c)) for c in name)
-    if len(safe.encode()) > MAX_NAME:
-        safe = f"{safe.encode()[:MAX_NAME - 17].decode(errors='ignore')}~{hashlib.sha256(os.fsencode(name)).hexdigest()[:16]}"
-    return safe
+def _label(name: str) -> str:
+    """The name, or, if it cannot name a file of ours, what can be read of it and a hash that tells it from others."""
+    try:
+        return plain_name(name)
+    except ValueError:
+        readable = "".join(character if character.isprintable() else "_" for character in clean_text(name, 100))
+        return f"{readable}-{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
 
 
 def _folders(parent: Path) -> list[Path]:
@@ -90,7 +96,11 @@ def parse(content: bytes) -> nbformat.NotebookNode:
             raise BadNotebook("The file is JSON but no notebook.")
         if document.get("nbformat", 4) < 4:
             document = nbformat.convert(nbformat.from_dict(document), 4)
-        return nbformat.from_dict({"nbformat": 4, "nbformat_minor": 5, "metadata": {}, "cells": [_cell(c) for c in document["cells"]]})
+        if len(document["cells"]) > MAX_CELLS:
+            raise BadNotebook(f"The notebook has {len(document['cells'])} cells; at most {MAX_CELLS} are graded.")
+        return nbformat.from_dict(
+            {"nbformat": 4, "nbformat_minor": 5, "metadata": {}, "cells": [_cell(c) for c in document["cells"]]}
+        )
     except BadNotebook:
         raise
     except UnicodeDecodeError:
@@ -136,20 +146,52 @@ def _read_regular(path: Path, limit: int) -> bytes:
 
 
 def _collect(folder: Path, submission: Submission) -> None:
+    """The regular files beside the notebook, up to the limits; a flag for everything else."""
     total = 0
-    for parent, folders, names in os.walk(folder, followlinks=False):
-        linked = [name for name in folders if os.path.islink(os.path.join(parent, name))]
-        for name in sorted([*names, *linked]):
-            path = Path(parent, name)
-            relative = str(path.relative_to(folder))
-            if relative == f"{folder.name}.ipynb":
-                continue
-            status = path.lstat()
-            total += status.st_size
-            if not stat.S_ISREG(status.st_mode):
-                submission.flags.append(f"ignored_file: {relative[:200]} (a link or special file)")
-            elif len(submission.files) >= MAX_SIDE_FILES or total > MAX_SIDE_BYTES:
-                submission.flags.append(f"ignored_files: more than {MAX_SIDE_FILES} files or {MAX_SIDE_BYTES >> 20} MB beside the notebook")
-                return
-            else:
-                submission.files[relative] = path
+    for number, (relative, entry) in enumerate(_entries(folder)):
+        if number >= MAX_ENTRIES:
+            submission.flags.append(f"ignored_files: more than {MAX_ENTRIES} entries in the folder")
+            return
+        if relative == f"{submission.assignment}.ipynb" or _can_be_entered(relative, entry):
+            continue
+        size = _readable_size(entry)
+        if size is None or len(os.fsencode(relative)) > MAX_PATH:
+            submission.flags.append(f"ignored_file: {relative[:200]} (a link, a special file, unreadable, or too deep)")
+            continue
+        total += size
+        if len(submission.files) >= MAX_SIDE_FILES or total > MAX_SIDE_BYTES:
+            submission.flags.append(
+                f"ignored_files: more than {MAX_SIDE_FILES} files or {MAX_SIDE_BYTES >> 20} MB beside the notebook"
+            )
+            return
+        submission.files[relative] = Path(entry.path)
+
+
+def _entries(folder: Path) -> Iterator[tuple[str, os.DirEntry[str]]]:
+    """(relative path, entry) of all that is in a folder; links are never followed, nor folders that are too deep."""
+    waiting = [""]  # a stack of our own: os.walk's recursion has an end, a hostile tree need not have one
+    while waiting:
+        parent = waiting.pop()
+        try:
+            with os.scandir(folder / parent) as scan:
+                entries = sorted(scan, key=lambda entry: entry.name)
+        except OSError:
+            continue
+        for entry in entries:
+            relative = os.path.join(parent, entry.name)
+            if _can_be_entered(relative, entry):
+                waiting.append(relative)
+            yield relative, entry
+
+
+def _can_be_entered(relative: str, entry: os.DirEntry[str]) -> bool:
+    return entry.is_dir(follow_symlinks=False) and len(os.fsencode(relative)) <= MAX_PATH
+
+
+def _readable_size(entry: os.DirEntry[str]) -> int | None:
+    """Bytes of a regular file that can be opened; None for everything else."""
+    try:
+        status = entry.stat(follow_symlinks=False)
+        return status.st_size if stat.S_ISREG(status.st_mode) and os.access(entry.path, os.R_OK) else None
+    except OSError:
+        return None

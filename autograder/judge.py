@@ -21,7 +21,7 @@ import numpy as np
 import course_lib
 from autograder import assemble, chapter, checks, freeze, intake
 from autograder.paths import ROOT
-from autograder.sandbox import Sandbox, SandboxDied, SandboxError, SandboxGarbage, SandboxTimeout, SandboxUnavailable
+from autograder.sandbox import Sandbox, SandboxDied, SandboxError, SandboxGarbage, SandboxTimeout
 from autograder.verdicts import Item, Verdict, clean_text
 from course_lib.cases import FrozenExercise, Observation, decode, encode
 from course_lib.diagnosis import Finding, diagnose
@@ -31,6 +31,7 @@ WORKER = Path(__file__).with_name("worker.py")
 COURSE_LIB = Path(course_lib.__file__).parent
 START_SECONDS = 120.0  # importing torch on a busy machine; nothing of the learner's has run by then
 GRACE_SECONDS = 5.0  # how much longer the judge waits than the worker's own timer
+MAX_TEXT = 4 << 20  # bytes of a worker's answer that are not numbers; honest ones have a hundredth of it
 SLACK_SECONDS = 10.0  # for starting sandboxes, on top of (exercises + 1) * timeout
 
 
@@ -60,14 +61,18 @@ def released(assignment: str) -> Released:
     tests = {f"test_{name}" for name in names}
     questions = {name for name, _ in outline.open_questions}
     live = frozenset(_squeezed(cell.source) for cell in page.cells if cell.kind == "code" and "live" in cell.tags)
-    return Released(assignment, exercises, tuple(outline.open_questions), frozenset(names | tests | questions), live, environment())
+    return Released(
+        assignment, exercises, tuple(outline.open_questions), frozenset(names | tests | questions), live, environment()
+    )
 
 
 @functools.cache
 def environment() -> str:
     """sha256 of the pins, the checks, the references and the code that judges: what a score depends on beside the submission."""
     folders = ("autograder", "solutions", "course_lib")
-    files = [ROOT / "requirements.txt", ROOT / "constraints.txt"] + [p for folder in folders for p in (ROOT / folder).rglob("*.py")]
+    files = [ROOT / "requirements.txt", ROOT / "constraints.txt"] + [
+        p for folder in folders for p in (ROOT / folder).rglob("*.py")
+    ]
     digest = hashlib.sha256()
     for path in sorted(files):
         digest.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes() + b"\0")
@@ -100,9 +105,7 @@ def judge(submission: intake.Submission, release: Released, timeout: float = 60.
         findings = run.findings()
         flags += run.flags
         status = "needs_review" if tampered else "graded"
-    items = [
-        Item(f.exercise, f.score, f.max_score, f.state, tuple(f.misconceptions), clean_text(f.message)) for f in findings
-    ]
+    items = [Item(f.exercise, f.score, f.max_score, f.state, tuple(f.misconceptions), clean_text(f.message)) for f in findings]
     items += [Item(name, 0.0, points, "manual") for name, points in release.open_questions]
     return Verdict.of(
         Verdict(
@@ -123,7 +126,9 @@ def judge(submission: intake.Submission, release: Released, timeout: float = 60.
 def unknown_assignment(submission: intake.Submission) -> Verdict:
     """The verdict on a folder whose name is no assignment of the course."""
     flags = ("unknown_assignment", *submission.flags)
-    return Verdict.of(Verdict(submission.student, submission.assignment, "student_error", 0.0, 0.0, flags=flags, environment=environment()))
+    return Verdict.of(
+        Verdict(submission.student, submission.assignment, "student_error", 0.0, 0.0, flags=flags, environment=environment())
+    )
 
 
 def tampering(notebook: Any, release: Released) -> list[str]:
@@ -163,6 +168,7 @@ class _Run:
         self._cells = runnable(self.submission.notebook, self.release)
         self._loading_failures: dict[str, str] = {}
         self._reserved = 0
+        self._apart = False  # each exercise in a sandbox of its own, with the cells up to its definition and none after it
         self._deadline = time.monotonic() + (len(self.release.exercises) + 1) * self.timeout + SLACK_SECONDS
         found: dict[str, Finding] = {}
         pending = list(self.release.exercises)
@@ -179,7 +185,13 @@ class _Run:
                         found[exercise.name] = self._timed_out(exercise)
                         break
                     except (SandboxError, ValueError) as error:
+                        if isinstance(error, SandboxDied) and self._may_be_a_later_cells_doing(exercise):
+                            self._apart = True
+                            pending.insert(0, exercise)
+                            break
                         found[exercise.name] = _failed(exercise, "error", f"The call ended the process: {error}.")
+                        break
+                    if self._apart:
                         break
         return [found.get(exercise.name) or self._timed_out(exercise) for exercise in self.release.exercises]
 
@@ -201,19 +213,28 @@ class _Run:
         except (SandboxTimeout, SandboxDied, SandboxGarbage, ValueError) as error:
             raise WorkerFailed(f"the worker did not start: {error}") from error
 
+    def _may_be_a_later_cells_doing(self, exercise: FrozenExercise) -> bool:
+        """Whether a process that was lost in a call may be lost to what a cell after the definition left running in it."""
+        return not self._apart and 0 <= _last_definition(exercise.name, self._cells) < len(self._cells) - 1
+
+    def _cells_for(self, exercise: FrozenExercise) -> list[tuple[int, str]]:
+        defined = _last_definition(exercise.name, self._cells)
+        return self._cells[: defined + 1] if self._apart and defined >= 0 else self._cells
+
     def _load(self, sandbox: Sandbox, pending: list[FrozenExercise]) -> bool:
         """Run the learner's cells. If one hangs or ends the process, drop it, so that the next attempt goes round it."""
         running = None
         until = time.monotonic() + self._loading_time(pending)
         try:
-            sandbox.send(encode({"cells": self._cells}), self._left(until))
-            while True:
-                told = _mapping(decode(sandbox.receive(self._left(until))))
+            sandbox.send(encode({"cells": self._cells_for(pending[0])}), self._left(until))
+            while time.monotonic() < until:
+                told = _told(sandbox, self._left(until))
                 if "loaded" in told:
                     self._loading_failures = {str(number): str(text) for number, text in _mapping(told["loaded"]).items()}
                     return True
-                running = int(told["running"])
-        except (SandboxError, ValueError, KeyError, TypeError) as error:
+                running = _number(told)
+            raise SandboxTimeout("the cells are not done in time")
+        except (SandboxError, ValueError) as error:
             self._drop(running, error, pending)
             return False
 
@@ -223,6 +244,8 @@ class _Run:
 
     def _drop(self, running: int | None, error: Exception, pending: list[FrozenExercise]) -> None:
         if not self._cells:
+            if isinstance(error, SandboxTimeout) and time.monotonic() >= self._deadline:
+                return  # all of the submission's time is spent: that is its own doing
             raise WorkerFailed(f"the worker failed with nothing to run: {error}") from error
         numbers = [number for number, _ in self._cells]
         position = numbers.index(running) if running in numbers else len(numbers) - 1
@@ -242,7 +265,7 @@ class _Run:
         cases = [{"arguments": case.arguments, "differentiate": case.differentiate} for case in exercise.cases]
         sandbox.send(encode({"exercise": exercise.name, "seconds": seconds, "cases": cases}), GRACE_SECONDS)
         patience = min(seconds + GRACE_SECONDS, max(self._deadline - time.monotonic(), 0.1) + 1)
-        told = _mapping(decode(sandbox.receive(patience)))
+        told = _told(sandbox, patience)
         if "observations" in told:
             return diagnose(exercise, _observations(told["observations"], exercise))
         if told.get("missing"):
@@ -272,11 +295,23 @@ def _failed(exercise: FrozenExercise, state: str, message: str) -> Finding:
 
 def _last_definition(name: str, cells: Sequence[tuple[int, str]]) -> int:
     """The position of the last cell that defines `name`, as text (a hostile cell is not worth parsing); -1 if none does."""
-    pattern = re.compile(rf"^\s*(?:(?:async\s+)?def\s+{name}\s*\(|class\s+{name}\b|{name}\s*(?::[^=\n]*)?=[^=])", re.MULTILINE)
+    # [ \t], for \s would run on over empty lines, from every one of them: a cell of nothing else would take for ever
+    pattern = re.compile(rf"^[ \t]*(?:(?:async\s+)?def\s+{name}\s*\(|class\s+{name}\b|{name}\s*(?::[^=\n]*)?=[^=])", re.MULTILINE)
     return max((position for position, (_, source) in enumerate(cells) if pattern.search(source)), default=-1)
 
 
 # -------------------------------------------------------------------------------- what comes out of the sandbox, strictly
+
+
+def _told(sandbox: Sandbox, seconds: float) -> dict[str, Any]:
+    return _mapping(decode(sandbox.receive(seconds), MAX_TEXT))
+
+
+def _number(told: dict[str, Any]) -> int:
+    number = told.get("running")
+    if not isinstance(number, int):
+        raise ValueError("the answer names no cell")
+    return number
 
 
 def _mapping(data: Any) -> dict[str, Any]:
@@ -300,9 +335,16 @@ def _observation(data: Any) -> Observation:
         raise ValueError("the answer has something else where text belongs")
     if not all(isinstance(array, np.ndarray) and array.dtype.kind in "fiub" for array in arrays):
         raise ValueError("the answer has something else where numbers belong")
-    if _kind(seen.outputs) != seen.kind and seen.outputs:
+    if not _consistent(seen):
         raise ValueError("the answer contradicts itself")
     return seen
+
+
+def _consistent(seen: Observation) -> bool:
+    """Whether the outputs are those that the kind promises: what compares them goes by the kind."""
+    if seen.outputs:
+        return seen.kind == _kind(seen.outputs)
+    return seen.kind in ("tuple of 0", "dict of ") or (seen.kind != "tensor" and " of " not in seen.kind)
 
 
 def _list(value: Any) -> list[Any]:

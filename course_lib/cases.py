@@ -67,7 +67,8 @@ class FrozenCase:
 
 @dataclass
 class FrozenExercise:
-    """All cases of one exercise. `criteria` maps facets to points, `messages` misconceptions to what the learner reads.
+    """All cases of one exercise. `criteria` maps facets to points, `messages` misconceptions to what the learner reads, and
+    `signatures` misconceptions to the facets in which they differ from what is right.
 
     `axes` names the axes of the outputs; `last_step_first` is set where errors travel backwards in time, so that the latest wrong
     step is the one to look at.
@@ -76,6 +77,7 @@ class FrozenExercise:
     name: str
     criteria: dict[str, float]
     messages: dict[str, str]
+    signatures: dict[str, list[str]]
     cases: list[FrozenCase]
     axes: list[str] = field(default_factory=list)
     last_step_first: bool = False
@@ -114,10 +116,15 @@ def encode(data: Any) -> bytes:
     return safetensors.numpy.save({"json": np.frombuffer(text.encode(), np.uint8), **arrays})
 
 
-def decode(payload: bytes) -> Any:
-    """The data that `encode` made. Raises ValueError for anything else."""
+def decode(payload: bytes, text_limit: int | None = None) -> Any:
+    """The data that `encode` made. Raises ValueError for anything else, and for more than `text_limit` bytes beside the arrays:
+    a small text of brackets parses into objects of thirty times its size."""
     try:
+        if text_limit is not None and int.from_bytes(payload[:8], "little") > text_limit:  # the length of the arrays' directory
+            raise ValueError("too many arrays")
         arrays = safetensors.numpy.load(payload)
+        if text_limit is not None and arrays["json"].nbytes > text_limit:
+            raise ValueError("too much text")
         return _unflatten(arrays["json"].tobytes().decode(), arrays)
     except Exception as error:  # whatever a hostile sender provokes in a parser is one and the same to the receiver
         raise ValueError(f"not a message: {type(error).__name__}") from None

@@ -56,7 +56,11 @@ class CheckResult:
     def __repr__(self) -> str:
         mark = "✓" if self.passed else "✗"
         return "\n".join(
-            [f"{mark} {self._headline()}", *(f"  {line}" for line in self._lines()), *(f"  {m} {text}" for m, text in self._ticks())]
+            [
+                f"{mark} {self._headline()}",
+                *(f"  {line}" for line in self._lines()),
+                *(f"  {m} {text}" for m, text in self._ticks()),
+            ]
         )
 
     def _repr_html_(self) -> str:
@@ -99,7 +103,9 @@ def visible_cases(name: str) -> FrozenExercise:
     if name in known:
         return load(FROZEN / f"{name}.npz")
     if not known:
-        raise LookupError("This copy of course_lib has no frozen checks: install the course_lib folder of your bundle (in the repository: make book).")
+        raise LookupError(
+            "This copy of course_lib has no frozen checks: install the course_lib folder of your bundle (in the repository: make book)."
+        )
     close = difflib.get_close_matches(name, known, 1)
     hint = f"Did you mean {close[0]}?" if close else f"Exercises: {', '.join(known)}."
     raise LookupError(f"There is no exercise called {name}. {hint}")

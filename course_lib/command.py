@@ -33,8 +33,8 @@ def main(arguments: list[str]) -> int:
     os.environ.setdefault("MPLBACKEND", "Agg")
     namespace = new_namespace()
     failures = run_cells(cells, namespace)
-    for position, error in failures.items():
-        print(f"! code cell {position + 1} stopped: {type(error).__name__}: {error}")
+    for position, failure in failures.items():
+        print(f"! code cell {position + 1} stopped: {type(failure).__name__}: {failure}")
     passed = 0
     for name in wanted:
         if not callable(namespace.get(name)):
@@ -45,4 +45,3 @@ def main(arguments: list[str]) -> int:
         passed += result.passed
     print(f"{passed} of {len(wanted)} pass")
     return 0 if passed == len(wanted) else 1
-

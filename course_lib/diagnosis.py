@@ -53,10 +53,7 @@ def diagnose(exercise: FrozenExercise, observations: Sequence[Observation]) -> F
     paid = 0.0 if "values" in failed else sum(points for facet, points in exercise.criteria.items() if facet not in failed)
     named = _explanations(exercise, pairs, failed)
     crashed = next((seen for (_, seen), facets in zip(pairs, differing, strict=True) if "values" in facets and seen.error), None)
-    if paid:
-        state = "partial"
-    else:
-        state = "error" if crashed and not named else "wrong"
+    state = "partial" if paid else "error" if crashed and not named else "wrong"
     lines = [f"Looks like {name}: {exercise.messages[name]}" for name in named]
     lines += _descriptions(exercise, pairs, differing, failed)
     return Finding(exercise.name, state, round(paid, 4), exercise.points, named, "\n".join(lines), failed)
@@ -100,8 +97,13 @@ def _close(seen: np.ndarray, target: np.ndarray, case: FrozenCase) -> np.ndarray
         return np.isclose(seen, target, rtol=rtol, atol=atol, equal_nan=True)
 
 
+def signature(name: str, cases: Sequence[FrozenCase]) -> list[str]:
+    """The facets in which a misconception differs from what is right, over all cases."""
+    return sorted(set().union(*(_differs_from_expected(case, case.misconceptions[name]) for case in cases)))
+
+
 def _values_agree(seen: np.ndarray, target: np.ndarray, case: FrozenCase) -> bool:
-    return seen.shape == target.shape and bool(_close(seen, target, case).all())
+    return seen.shape == target.shape and (np.array_equal(seen, target) or bool(_close(seen, target, case).all()))
 
 
 def _gradients_agree(seen: Observation, target: Observation, case: FrozenCase) -> bool:
@@ -116,26 +118,31 @@ def _gradients_agree(seen: Observation, target: Observation, case: FrozenCase) -
 
 def _explanations(exercise: FrozenExercise, pairs: list[tuple[FrozenCase, Observation]], failed: list[str]) -> list[str]:
     """What explains all that was seen or, failing that, all wrong values: a leaking gradient beside them can wait."""
-    named = _explaining(exercise, pairs, failed, set(FACET_TEXT))
-    return named or ("values" in failed and _explaining(exercise, pairs, failed, {"values"})) or []
+    if "values" not in failed:
+        return _explaining(exercise, pairs, failed, set(FACET_TEXT))
+    return _explaining(exercise, pairs, failed, set(FACET_TEXT), "values") or _explaining(
+        exercise, pairs, failed, {"values"}, "values"
+    )
 
 
 def _explaining(
-    exercise: FrozenExercise, pairs: list[tuple[FrozenCase, Observation]], failed: list[str], considered: set[str]
+    exercise: FrozenExercise,
+    pairs: list[tuple[FrozenCase, Observation]],
+    failed: list[str],
+    considered: set[str],
+    foremost: str = "",
 ) -> list[str]:
-    explained: dict[str, set[str]] = {}
-    for name in exercise.messages:
-        signature: set[str] = set()
-        unlike: set[str] = set()
-        for case, seen in pairs:
-            shown = case.misconceptions[name]
-            signature |= considered & min((differing_facets(shown, right, case) for right in case.expected), key=len)
-            unlike |= differing_facets(seen, shown, case)
-            if signature & unlike or not signature <= set(failed):  # no later case can mend that
-                break
-        explains_values = "values" in signature or "values" not in failed  # else it would name a scratch on a wreck
-        if signature and signature <= set(failed) and not signature & unlike and explains_values:
-            explained[name] = signature
+    """The misconceptions whose `considered` facets were all seen as they would show them. With wrong values, one that is about something
+    else only would name a scratch on a wreck: `foremost` must be among the facets."""
+
+    def explains(name: str, facets: set[str]) -> bool:
+        if not facets or not facets <= set(failed) or (foremost and foremost not in facets):
+            return False
+        return not any(facets & differing_facets(seen, case.misconceptions[name], case) for case, seen in pairs)
+
+    explained = {
+        name: considered & set(facets) for name, facets in exercise.signatures.items() if explains(name, considered & set(facets))
+    }
     return [name for name, facets in explained.items() if not any(facets < others for others in explained.values())]
 
 

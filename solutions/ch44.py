@@ -17,8 +17,9 @@ def td_residuals(rewards, values, next_values, terminated, gamma=0.99):
     Args:
       rewards: r_t, in units of reward; (T, N).
       values: V(s_t), the critic's estimate; (T, N).
-      next_values: V of the true successor of each step, never of the observation after a reset; (T, N).
-      terminated: True where the task itself ended, so that nothing follows; (T, N) bool.
+      next_values: V of the true successor of each step, never of the observation
+        after a reset; (T, N).
+      terminated: True where the task itself ended: nothing follows; (T, N) bool.
       gamma: discount per step, in [0, 1].
 
     Returns: (T, N) residuals in units of reward, without a graph.
@@ -40,13 +41,16 @@ def compute_gae(rewards, values, next_values, terminated, truncated, gamma=0.99,
       rewards: r_t, in units of reward; (T, N).
       values: V(s_t); (T, N).
       next_values: V of the true successor of each step; (T, N).
-      terminated: True where the task itself ended: no bootstrap, no recursion; (T, N) bool.
-      truncated: True where a time limit cut the episode: bootstrap, but no recursion; (T, N) bool.
+      terminated: True where the task itself ended: no bootstrap, no recursion;
+        (T, N) bool.
+      truncated: True where a time limit cut the episode: bootstrap, no recursion;
+        (T, N) bool.
       gamma: discount per step, in [0, 1].
-      gae_lambda: λ in [0, 1]: 0 is the one-step residual, 1 the Monte Carlo return minus the value.
+      gae_lambda: λ in [0, 1]; 0 gives the one-step residual, 1 the Monte Carlo return
+        minus the value.
 
     Returns: (T, N) advantages in units of reward, without a graph.
-    Raises: ValueError if the shapes differ, or gamma or gae_lambda lies outside [0, 1].
+    Raises: ValueError if shapes differ, or gamma or gae_lambda lies outside [0, 1].
     """
     validate.same_shape(rewards=rewards, values=values, next_values=next_values, terminated=terminated, truncated=truncated)
     validate.unit_interval(gamma=gamma, gae_lambda=gae_lambda)
@@ -65,10 +69,11 @@ def lambda_returns(advantages, values):
 
         R_t = A_t + V(s_t)
 
-    They are not the Monte Carlo returns unless λ = 1. Sutton and Barto (2018), eq. 12.3.
+    They are the Monte Carlo returns only at λ = 1. Sutton and Barto (2018), eq. 12.3.
 
     Args:
-      advantages: generalised advantage estimates, not normalised, in units of reward; (T, N).
+      advantages: generalised advantage estimates in units of reward, not normalised;
+        (T, N).
       values: V(s_t) as used in the estimates; (T, N).
 
     Returns: (T, N) returns in units of reward, without a graph.
@@ -99,7 +104,8 @@ def explained_variance(values, returns):
 
         1 - Var(returns - values) / Var(returns)
 
-    1 is perfect, 0 is no better than a constant, negative is worse. Stable-Baselines3 logs it under this name.
+    1 is perfect, 0 is no better than a constant, negative is worse. Stable-Baselines3
+    logs it under this name.
 
     Args:
       values: V(s), in units of reward; any shape.
@@ -115,16 +121,16 @@ def explained_variance(values, returns):
 
 
 def repaired_targets(rewards, values, next_values, terminated, truncated, gamma=0.99, gae_lambda=0.95):
-    """What the suspect program of the bug lab should have fed to its two losses.
+    """What the suspect program should have fed to its two losses.
 
     Args:
       rewards, values, next_values: in units of reward; (T, N).
       terminated, truncated: (T, N) bool.
       gamma, gae_lambda: in [0, 1].
 
-    Returns: (advantages, returns), both (T, N), without a graph: the advantages normalised over all elements for the
-      policy's loss, the λ-returns in units of reward for the critic's.
-    Raises: ValueError if the shapes differ, or gamma or gae_lambda lies outside [0, 1].
+    Returns: (advantages, returns), both (T, N), without a graph: for the policy's loss the
+      advantages, normalised over all elements; for the critic's loss its targets.
+    Raises: ValueError if shapes differ, or gamma or gae_lambda lies outside [0, 1].
     """
     advantages = compute_gae(rewards, values, next_values, terminated, truncated, gamma, gae_lambda)
     return normalize_advantages(advantages), lambda_returns(advantages, values)

@@ -2,8 +2,8 @@
 
     python tools/bench_grading.py [SUBMISSIONS]
 
-The submissions are solved notebooks of chapter 44 in five styles. Their live cells (training, plots) are emptied for both: `course grade` never
-runs them, and nbgrader would, for half a minute each. Both graders use the same two processors; nbgrader has no parallel mode.
+The submissions are solved notebooks of chapter 44. Their live cells (training, plots) are emptied for both: `course grade`
+never runs them, and nbgrader would, for half a minute each. Both have the same two processors; nbgrader has no parallel mode.
 """
 
 from __future__ import annotations
@@ -54,8 +54,14 @@ def main(count: int) -> None:
             folder = course / "submitted" / f"s{number:03}" / "ch44"
             folder.mkdir(parents=True)
             nbformat.write(solved(released, number), folder / "ch44.ipynb")
-        timed([sys.executable, "-m", "nbgrader", "generate_assignment", "ch44", "--create", "--force"], course, base / "generate.log")
-        ours = timed([sys.executable, "-m", "autograder", "grade", str(course / "submitted"), "--jobs", "2"], base, base / "ours.log")
+        timed(
+            [sys.executable, "-m", "nbgrader", "generate_assignment", "ch44", "--create", "--force"],
+            course,
+            base / "generate.log",
+        )
+        ours = timed(
+            [sys.executable, "-m", "autograder", "grade", str(course / "submitted"), "--jobs", "2"], base, base / "ours.log"
+        )
         stock = timed([sys.executable, "-m", "nbgrader", "autograde", "ch44", "--create"], course, base / "stock.log")
         graded = len(list((course / "autograded").glob("*/ch44/ch44.ipynb")))
         print(f"{count} submissions; course grade --jobs 2: {ours:.1f} s; nbgrader autograde: {stock:.1f} s ({graded} graded)")

@@ -157,13 +157,16 @@ def _residuals_by_hand(rewards, values, next_values, terminated, truncated, gamm
 
 _TD = ("rewards", "values", "next_values")
 _DETACH = (
-    "The result still hangs on the critic's graph. Advantages are data for the losses: detach the result, or work under torch.no_grad()."
+    "The result still hangs on the critic's graph. Advantages are data for the losses: "
+    "detach the result, or work under torch.no_grad()."
 )
 _VALIDATE = (
     "Shapes that differ broadcast silently into nonsense, and a discount outside [0, 1] diverges. "
     "Check the arguments first: course_lib.validate raises errors that name them."
 )
-_DTYPE = "The result has lost the inputs' dtype. Build buffers with torch.zeros_like, or cast back to the inputs' dtype at the end."
+_DTYPE = (
+    "The result has lost the inputs' dtype. Build buffers with torch.zeros_like, or cast back to the inputs' dtype at the end."
+)
 
 
 def _td_inputs(inputs):
@@ -323,7 +326,8 @@ TD_RESIDUALS = Exercise(
         Misconception(
             "shifted-values-as-next-values",
             _td(lambda r, v, v_next, alive, gamma: r + gamma * _shifted(v, v_next) * alive - v),
-            "values[t + 1] is the value of whatever came next in the buffer; where an episode was cut, that is another episode. Use next_values.",
+            "values[t + 1] is the value of whatever came next in the buffer; where an episode was cut, that is "
+            "another episode. Use next_values.",
         ),
         Misconception("graph-kept", _td_graph, _DETACH),
         Misconception("dtype-lost", lambda *args, **kwargs: ch44.td_residuals(*args, **kwargs).float(), _DTYPE),
@@ -367,7 +371,7 @@ def _validated(rewards, values, next_values, terminated, truncated, gamma, gae_l
 
 
 def _backward(deltas, carry):
-    advantages = []
+    advantages: list[torch.Tensor] = []
     following = torch.zeros_like(deltas[0])
     for delta, factor in zip(deltas.flip(0), carry.flip(0), strict=True):
         following = delta + factor * following
@@ -415,7 +419,9 @@ def _gae_residuals_only(rewards, values, next_values, terminated, truncated, gam
 
 def _gae_per_environment(rewards, values, next_values, terminated, truncated, gamma=0.99, gae_lambda=0.95):
     """Plain Python, an environment after the other."""
-    _refuse(gamma, gae_lambda, rewards=rewards, values=values, next_values=next_values, terminated=terminated, truncated=truncated)
+    _refuse(
+        gamma, gae_lambda, rewards=rewards, values=values, next_values=next_values, terminated=terminated, truncated=truncated
+    )
     steps, envs = rewards.shape
     result = [[0.0] * envs for _ in range(steps)]
     for env in range(envs):
@@ -431,7 +437,9 @@ def _gae_per_environment(rewards, values, next_values, terminated, truncated, ga
 
 def _gae_numpy(rewards, values, next_values, terminated, truncated, gamma=0.99, gae_lambda=0.95):
     """NumPy in double precision, cast back."""
-    _refuse(gamma, gae_lambda, rewards=rewards, values=values, next_values=next_values, terminated=terminated, truncated=truncated)
+    _refuse(
+        gamma, gae_lambda, rewards=rewards, values=values, next_values=next_values, terminated=terminated, truncated=truncated
+    )
     r, v, n = (x.detach().double().numpy() for x in (rewards, values, next_values))
     deltas = r + gamma * n * (1.0 - terminated.numpy()) - v
     stop = np.logical_or(terminated.numpy(), truncated.numpy())
@@ -444,7 +452,9 @@ def _gae_numpy(rewards, values, next_values, terminated, truncated, gamma=0.99, 
 
 def _gae_doubling(rewards, values, next_values, terminated, truncated, gamma=0.99, gae_lambda=0.95):
     """A scan by doubling: after k rounds every entry has summed 2**k steps."""
-    _refuse(gamma, gae_lambda, rewards=rewards, values=values, next_values=next_values, terminated=terminated, truncated=truncated)
+    _refuse(
+        gamma, gae_lambda, rewards=rewards, values=values, next_values=next_values, terminated=terminated, truncated=truncated
+    )
     with torch.no_grad():
         total = rewards + gamma * next_values.masked_fill(terminated, 0) - values
         weight = gamma * gae_lambda * (~(terminated | truncated)).to(total.dtype)
@@ -459,7 +469,9 @@ def _gae_doubling(rewards, values, next_values, terminated, truncated, gamma=0.9
 
 def _gae_by_episode(rewards, values, next_values, terminated, truncated, gamma=0.99, gae_lambda=0.95):
     """Cut each environment's steps into episodes and sum each by its definition, as a matrix product."""
-    _refuse(gamma, gae_lambda, rewards=rewards, values=values, next_values=next_values, terminated=terminated, truncated=truncated)
+    _refuse(
+        gamma, gae_lambda, rewards=rewards, values=values, next_values=next_values, terminated=terminated, truncated=truncated
+    )
     target = rewards.detach() + gamma * torch.where(terminated, torch.zeros_like(next_values), next_values).detach()
     deltas = target - values.detach()
     advantages = torch.empty_like(deltas)
@@ -477,7 +489,9 @@ def _gae_by_episode(rewards, values, next_values, terminated, truncated, gamma=0
 
 def _gae_in_own_buffer(rewards, values, next_values, terminated, truncated, gamma=0.99, gae_lambda=0.95):
     """In place, in a buffer of its own."""
-    _refuse(gamma, gae_lambda, rewards=rewards, values=values, next_values=next_values, terminated=terminated, truncated=truncated)
+    _refuse(
+        gamma, gae_lambda, rewards=rewards, values=values, next_values=next_values, terminated=terminated, truncated=truncated
+    )
     buffer = rewards.detach().clone()
     buffer.add_(next_values.detach() * (1 - terminated.to(buffer.dtype)), alpha=gamma).sub_(values.detach())
     keep = torch.logical_not(torch.logical_or(terminated, truncated)).to(buffer.dtype).mul_(gamma * gae_lambda)
@@ -513,7 +527,13 @@ COMPUTE_GAE = Exercise(
         Case("gae_lambda = -0.1", _with(_one_truncated, gae_lambda=-0.1), raises=["gae_lambda"], visible=True, draws=1),
         Case("gae_lambda = 2", _with(_one_truncated, gae_lambda=2), raises=["gae_lambda"], draws=1),
         *(
-            Case(f"{name} with a column too few", _cut(name, _one_truncated), raises=_ROLLOUT_NAMES, visible=name == "truncated", draws=1)
+            Case(
+                f"{name} with a column too few",
+                _cut(name, _one_truncated),
+                raises=_ROLLOUT_NAMES,
+                visible=name == "truncated",
+                draws=1,
+            )
             for name in _ROLLOUT_NAMES
         ),
     ),
@@ -545,12 +565,14 @@ COMPUTE_GAE = Exercise(
                 bootstrap=lambda terminated, truncated: torch.ones_like(terminated),
                 carry=lambda terminated, truncated: torch.ones_like(terminated),
             ),
-            "Neither the bootstrap nor the recursion looks at the episode's end: terminated removes the bootstrap, either flag stops the sum.",
+            "Neither the bootstrap nor the recursion looks at the episode's end: terminated removes the "
+            "bootstrap, either flag stops the sum.",
         ),
         Misconception(
             "ended-mask-of-the-next-step",
             _gae(carry=_next_ended),
-            "The recursion looks at the flag of step t + 1. Here a flag belongs to the step that it ends: use terminated[t] and truncated[t].",
+            "The recursion looks at the flag of step t + 1. Here a flag belongs to the step that it ends: use "
+            "terminated[t] and truncated[t].",
         ),
         Misconception(
             "lambda-missing",
@@ -565,10 +587,17 @@ COMPUTE_GAE = Exercise(
         Misconception(
             "shifted-values-as-next-values",
             _gae(following=_shifted),
-            "values[t + 1] is the value of whatever came next in the buffer; where an episode was cut, that is another episode. Use next_values.",
+            "values[t + 1] is the value of whatever came next in the buffer; where an episode was cut, that is "
+            "another episode. Use next_values.",
         ),
-        Misconception("residuals-only", _gae_residuals_only, "This is the one-step residual: later residuals are missing (lambda = 0)."),
-        Misconception("values-added", _gae_plus_values, "These are the lambda-returns: advantages plus values. The advantage is the part above V."),
+        Misconception(
+            "residuals-only", _gae_residuals_only, "This is the one-step residual: later residuals are missing (lambda = 0)."
+        ),
+        Misconception(
+            "values-added",
+            _gae_plus_values,
+            "These are the lambda-returns: advantages plus values. The advantage is the part above V.",
+        ),
         Misconception(
             "wrong-axis", _gae_wrong_axis, "The sum runs over environments instead of time: the first axis is time, (T, N)."
         ),
@@ -650,7 +679,9 @@ def _returns_buffer(advantages, values):
 
 def _returns_rows(advantages, values):
     _refuse(advantages=advantages, values=values)
-    return torch.stack([a.double() + v.double() for a, v in zip(advantages.detach(), values.detach(), strict=True)]).to(values.dtype)
+    return torch.stack([a.double() + v.double() for a, v in zip(advantages.detach(), values.detach(), strict=True)]).to(
+        values.dtype
+    )
 
 
 LAMBDA_RETURNS = Exercise(
@@ -673,9 +704,21 @@ LAMBDA_RETURNS = Exercise(
             _returns(lambda a, v: a.clone()),
             "The critic must be fitted to a return, not to the advantage: add the values that the advantage was measured against.",
         ),
-        Misconception("values-returned", _returns(lambda a, v: v.clone()), "Fitting the critic to its own values teaches it nothing: add the advantages."),
-        Misconception("difference-flipped", _returns(lambda a, v: v - a), "The advantage is return minus value, so the return is value plus advantage."),
-        Misconception("value-subtracted", _returns(lambda a, v: a - v), "The value was already subtracted inside the advantage: add it back."),
+        Misconception(
+            "values-returned",
+            _returns(lambda a, v: v.clone()),
+            "Fitting the critic to its own values teaches it nothing: add the advantages.",
+        ),
+        Misconception(
+            "difference-flipped",
+            _returns(lambda a, v: v - a),
+            "The advantage is return minus value, so the return is value plus advantage.",
+        ),
+        Misconception(
+            "value-subtracted",
+            _returns(lambda a, v: a - v),
+            "The value was already subtracted inside the advantage: add it back.",
+        ),
         Misconception(
             "advantages-normalised-first",
             _returns(lambda a, v: ch44.normalize_advantages(a) + v if a.numel() > 1 else a + v),
@@ -689,7 +732,9 @@ LAMBDA_RETURNS = Exercise(
         Misconception("graph-kept", _returns_graph, "The target would move with the critic that chases it: detach it."),
         Misconception("dtype-lost", _returns(lambda a, v: (a + v).float()), _DTYPE),
         Misconception(
-            "advantages-changed-in-place", _returns_in_place, "advantages += values changes the caller's advantages, which the policy's loss still needs."
+            "advantages-changed-in-place",
+            _returns_in_place,
+            "advantages += values changes the caller's advantages, which the policy's loss still needs.",
         ),
         Misconception("bad-input-accepted", lambda advantages, values: (advantages + values).detach(), _VALIDATE),
     ),
@@ -921,7 +966,11 @@ EXPLAINED_VARIANCE = Exercise(
         Case("a flat batch", _flat_critic, visible=True),
         Case("a critic worse than a constant", _bad_critic, visible=True),
         Case("a perfect critic", _perfect_critic, closed_form=lambda values, returns: torch.ones((), dtype=returns.dtype)),
-        Case("a critic that is right up to a constant", _shifted_critic, closed_form=lambda values, returns: torch.ones((), dtype=returns.dtype)),
+        Case(
+            "a critic that is right up to a constant",
+            _shifted_critic,
+            closed_form=lambda values, returns: torch.ones((), dtype=returns.dtype),
+        ),
         Case(
             "constant returns: NaN",
             _constant_returns,
@@ -974,13 +1023,23 @@ EXPLAINED_VARIANCE = Exercise(
             _explained_naive,
             "Constant returns have no variance to explain: return NaN there, not minus infinity.",
         ),
-        Misconception("zero-for-constant-returns", _explained_zero, "0 would claim a useless critic; with constant returns nothing can be said: NaN."),
+        Misconception(
+            "zero-for-constant-returns",
+            _explained_zero,
+            "0 would claim a useless critic; with constant returns nothing can be said: NaN.",
+        ),
         Misconception("graph-kept", _explained_graph, "A metric carries no graph: detach it."),
-        Misconception("python-float", lambda values, returns: ch44.explained_variance(values, returns).item(), "Return a 0-dim tensor, not a Python float."),
+        Misconception(
+            "python-float",
+            lambda values, returns: ch44.explained_variance(values, returns).item(),
+            "Return a 0-dim tensor, not a Python float.",
+        ),
         Misconception("dtype-lost", lambda values, returns: ch44.explained_variance(values, returns).float(), _DTYPE),
         Misconception(
             "bad-input-accepted",
-            lambda values, returns: torch.where(returns.var() == 0, math.nan, 1 - (returns - values).var() / returns.var()).detach(),
+            lambda values, returns: torch.where(
+                returns.var() == 0, math.nan, 1 - (returns - values).var() / returns.var()
+            ).detach(),
             _VALIDATE,
         ),
     ),
@@ -1042,7 +1101,11 @@ REPAIRED_TARGETS = Exercise(
             _targets(returns_of=_unrepaired_returns),
             "This is the suspect program's own bug. What unit do normalised advantages have, and what unit has a return?",
         ),
-        Misconception("advantages-not-normalised", _targets(advantages_of=lambda a: a), "The policy's advantages come back in units of reward: normalise them."),
+        Misconception(
+            "advantages-not-normalised",
+            _targets(advantages_of=lambda a: a),
+            "The policy's advantages come back in units of reward: normalise them.",
+        ),
         Misconception(
             "returns-normalised-too",
             _targets(returns_of=lambda a, v: ch44.normalize_advantages(ch44.lambda_returns(a, v))),

@@ -1,3 +1,4 @@
+import dataclasses
 import re
 
 import nbformat
@@ -54,29 +55,29 @@ def test_pages_open_with_the_facts(views):
 
 def test_exercises_are_announced_with_number_difficulty_minutes_and_criteria(views):
     for name in ("book", "student"):
-        heading, facts = _sources(views[name])["ch99-004-heading"].split("\n\n")[:2]
-        assert heading == "### Exercise 99.2: `quadruple`"
-        assert facts == "Difficulty ●●● (3 of 3) · about 1 hour 10 minutes · 3 points"
-        assert "| returns the right values | 2.5 |" in _sources(views[name])["ch99-004-heading"]
+        heading, facts = _sources(views[name])["ch99-004"].split("\n\n")[:2]
+        assert heading == "### Exercise 99.2: Twice twice"
+        assert facts == "`quadruple` · difficulty ●●● (3 of 3) · about 1 hour 10 minutes"
+        assert "**3 points:** 2.5 if it returns the right values" in _sources(views[name])["ch99-005-points"]
 
 
 def test_the_book_shows_stub_then_check_with_output_then_folded_reference(views):
     cells = {cell.id: cell for cell in views["book"].cells}
     order = list(cells)
-    stub = order.index("ch99-002")
-    assert order[stub - 1 : stub + 3] == ["ch99-002-heading", "ch99-002", "ch99-test_double", "ch99-002-reference"]
-    assert cells["ch99-002"].source.endswith("raise NotImplementedError") and not cells["ch99-002"].outputs
+    stub = order.index("ch99-003")
+    assert order[stub - 1 : stub + 3] == ["ch99-003-points", "ch99-003", "ch99-test_double", "ch99-003-reference"]
+    assert cells["ch99-003"].source.endswith("raise NotImplementedError") and not cells["ch99-003"].outputs
     assert cells["ch99-test_double"].source == "check(double)"
     assert cells["ch99-test_double"].outputs[0].text == "double: all checks pass\n"
-    folded = cells["ch99-002-reference"].source
+    folded = cells["ch99-003-reference"].source
     assert folded.startswith("::::{dropdown} Reference solution\n") and "total = x + x" in folded
 
 
 def test_live_and_book_only_cells_keep_their_outputs_in_the_book_with_words_for_pictures(views):
     cells = {cell.id: cell for cell in views["book"].cells}
-    assert cells["ch99-005"].outputs[0].text == "2.0\n" and cells["ch99-005"].metadata.tags == ["hide-input"]
-    assert "image/png" in cells["ch99-006"].outputs[1].data
-    assert cells["ch99-006"].metadata.mystnb.image.alt == "A rising line."
+    assert cells["ch99-006"].outputs[0].text == "2.0\n" and cells["ch99-006"].metadata.tags == ["hide-input"]
+    assert "image/png" in cells["ch99-007"].outputs[1].data
+    assert cells["ch99-007"].metadata.mystnb.image.alt == "A rising line."
 
 
 def test_a_book_without_solutions_holds_no_line_of_them(views):
@@ -115,22 +116,22 @@ def test_stubs_are_open_checks_locked_and_open_questions_graded_by_hand(views):
 
 
 def test_live_cells_stay_marked_and_hidden_input_is_collapsed(views):
-    cell = next(cell for cell in views["student"].cells if cell.id == "ch99-005")
+    cell = next(cell for cell in views["student"].cells if cell.id == "ch99-006")
     assert cell.metadata.tags == ["hide-input", "live"] and cell.metadata.jupyter.source_hidden and not cell.outputs
 
 
 def test_book_only_cells_become_what_was_recorded_or_say_where_to_look(tiny, views):
-    recorded = next(cell for cell in views["student"].cells if cell.id == "ch99-006")
-    assert recorded.source == "````text\nrecorded\n````\n\n![A rising line.](attachment:ch99-006-1.png)"
-    assert recorded.attachments["ch99-006-1.png"] == {"image/png": tiny.outputs[4][1].data["image/png"]}
-    assert _sources(views["unrecorded"])["ch99-006"] == "*See it live on the book's page of chapter 99.*"
+    recorded = next(cell for cell in views["student"].cells if cell.id == "ch99-007")
+    assert recorded.source == "````text\nrecorded\n````\n\n![A rising line.](attachment:ch99-007-1.png)"
+    assert recorded.attachments["ch99-007-1.png"] == {"image/png": tiny.outputs[4][1].data["image/png"]}
+    assert _sources(views["unrecorded"])["ch99-007"] == "*See it live on the book's page of chapter 99.*"
 
 
 def test_what_is_recorded_of_an_interactive_figure_is_its_text_and_where_to_find_it(tiny):
     outputs = [*tiny.outputs[:-1], [new_output("display_data", {"text/html": "<script></script>", "text/plain": "Two sliders"})]]
     view = assemble.student_view(tiny.chapter, outputs, tiny.sources(tiny.chapter))
     expected = "````text\nTwo sliders\n````\n\n*See it live on the book's page of chapter 99.*"
-    assert _sources(view)["ch99-006"] == expected
+    assert _sources(view)["ch99-007"] == expected
 
 
 def test_references_close_the_page(views):
@@ -141,3 +142,15 @@ def test_references_close_the_page(views):
 def test_outputs_of_another_version_of_the_chapter_are_refused(tiny):
     with pytest.raises(ChapterError, match="outputs of 4 code cells, but 5 code cells"):
         assemble.book_view(tiny.chapter, tiny.outputs[:-1], sources=tiny.sources(tiny.chapter))
+
+
+def test_a_book_without_solutions_keeps_what_book_only_cells_show_and_not_how(tiny):
+    page = assemble.book_view(tiny.chapter, tiny.outputs, with_solutions=False, sources=tiny.sources(tiny.chapter))
+    cell = next(cell for cell in page.cells if cell.id == "ch99-007")
+    assert "recorded" not in cell.source and cell.outputs
+
+
+def test_a_stub_without_a_heading_before_it_is_refused(tiny):
+    cells = tuple(cell for cell in tiny.chapter.cells if "Twice twice" not in cell.source)
+    with pytest.raises(ChapterError, match="before the stub of quadruple there must be a text with a heading"):
+        assemble.student_view(dataclasses.replace(tiny.chapter, cells=cells), sources=tiny.sources(tiny.chapter))

@@ -12,7 +12,9 @@ def run(*arguments):
     return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
 
 
-@pytest.mark.parametrize("arguments", [["grade"], ["grade", "x", "--jobs", "0"], ["grade", "x", "--timeout", "0"], ["nonsense"], ["check"]])
+@pytest.mark.parametrize(
+    "arguments", [["grade"], ["grade", "x", "--jobs", "0"], ["grade", "x", "--timeout", "0"], ["nonsense"], ["check"]]
+)
 def test_missing_and_wrong_arguments_are_refused(arguments):
     assert run(*arguments).exit_code == 2
 

@@ -2,12 +2,14 @@
 
 import json
 import os
+import subprocess
 
 import nbformat
 import pytest
 from nbformat.v4 import new_code_cell, new_notebook
 
 from autograder import intake
+from autograder.verdicts import plain_name
 
 GOOD = new_notebook(cells=[new_code_cell("a = 1", metadata={"nbgrader": {"grade_id": "f"}})])
 
@@ -111,16 +113,58 @@ def test_too_many_files_are_left_out_and_flagged(folder):
     assert len(submission.files) == intake.MAX_SIDE_FILES and "ignored_files" in submission.flags[0]
 
 
+def test_a_tree_without_end_is_left(folder):
+    put(folder, nbformat.writes(GOOD))
+    (folder / "z.txt").write_text("")
+    here = os.open(folder, os.O_RDONLY)
+    for _ in range(3000):  # deeper than Python recurses and than a path can be long
+        os.mkdir("d", dir_fd=here)
+        here, above = os.open("d", os.O_RDONLY, dir_fd=here), here
+        os.close(above)
+    os.close(here)
+    submission = intake.read("alice", "ch44", folder)
+    assert list(submission.files) == ["z.txt"] and "too deep" in submission.flags[0]
+    subprocess.run(["rm", "-r", folder / "d"], check=True)  # shutil, and with it pytest, would recurse
+
+
+def test_a_long_name_in_a_deep_folder_is_ignored_and_flagged(folder):
+    put(folder, nbformat.writes(GOOD))
+    deep = folder.joinpath(*["d" * 200] * 5)
+    deep.mkdir(parents=True)
+    (deep / "x").write_text("")
+    submission = intake.read("alice", "ch44", folder)
+    assert not submission.files and "too deep" in submission.flags[0]
+
+
+def test_more_entries_than_anybody_needs_are_not_counted(folder, monkeypatch):
+    monkeypatch.setattr(intake, "MAX_ENTRIES", 10)
+    put(folder, nbformat.writes(GOOD))
+    for number in range(20):
+        (folder / f"folder{number}").mkdir()
+    assert "entries" in intake.read("alice", "ch44", folder).flags[0]
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root can read everything")
+def test_an_unreadable_file_is_ignored_and_flagged(folder):
+    put(folder, nbformat.writes(GOOD))
+    (folder / "x").touch(mode=0)
+    assert "unreadable" in intake.read("alice", "ch44", folder).flags[0]
+
+
+def test_too_many_cells_are_refused(folder):
+    cells = [{"cell_type": "raw", "source": ""}] * (intake.MAX_CELLS + 1)
+    assert "cells" in put(folder, json.dumps({"nbformat": 4, "cells": cells})).problem
+
+
+@pytest.mark.parametrize("name", ["two\nlines", "tab\t", b"latin-\xe9".decode(errors="surrogateescape"), "x" * 255])
+def test_a_name_that_no_file_of_ours_can_have_is_replaced(tmp_path, name):
+    (tmp_path / name / name).mkdir(parents=True)
+    [(student, assignment, folder)] = intake.discover(tmp_path)
+    assert plain_name(student) == student == assignment and folder == tmp_path / name / name
+
+
 def test_discovery_ignores_dots_and_files(tmp_path, folder):
     (tmp_path / ".git" / "ch44").mkdir(parents=True)
     (tmp_path / "alice" / ".ipynb_checkpoints").mkdir()
     (tmp_path / "notes.txt").write_text("")
     assert intake.discover(tmp_path) == [("alice", "ch44", folder)]
-
-
-def test_names_that_no_file_of_ours_can_bear_are_written_out(tmp_path):
-    (tmp_path / "eve\n=1" / "ch44").mkdir(parents=True)
-    (tmp_path / ("x" * 255) / "ch44").mkdir(parents=True)
-    os.makedirs(os.path.join(os.fsencode(tmp_path), b"\xff", b"ch44"))
-    names = [student for student, _, _ in intake.discover(tmp_path)]
-    assert names[0] == "eve%0A=1" and "%FF" in names and any(len(name) == intake.MAX_NAME for name in names)

@@ -46,7 +46,7 @@ def test_a_bundle_has_notebooks_library_frozen_checks_and_a_readme(bundle):
     frozen = {name for name in files if "/frozen/" in name}
     assert frozen == {f"course_lib/course_lib/frozen/{name}.npz" for name in ("double", "quadruple")}
     assert b"`ch99/ch99.ipynb`: A tiny chapter: twice (90 minutes)" in files["README.md"]
-    assert b"attachment:ch99-006-1.png" in files["ch99/ch99.ipynb"]
+    assert b"attachment:ch99-007-1.png" in files["ch99/ch99.ipynb"]
 
 
 def test_two_releases_are_the_same_bytes(tiny, bundle, tmp_path):

@@ -58,8 +58,12 @@ def test_page_loads_from_disk_without_network_or_complaint(browser, html, name, 
 
 
 @pytest.mark.parametrize("name", CHAPTERS)
-def test_equations_are_rendered(browser, html, name):
-    with Visit(browser, html / f"{name}.html") as visit:
+def test_equations_are_rendered_and_begin_where_a_phone_can_show_them(browser, html, name):
+    with Visit(browser, html / f"{name}.html", "phone") as visit:
+        left = visit.page.locator("div.math mjx-container").evaluate_all(
+            "all => all.map(one => one.getBoundingClientRect().left)"
+        )
+        assert min(left) >= 0
         assert visit.page.locator("mjx-container").count() > 0
         assert visit.page.locator("mjx-merror").count() == 0
         assert visit.page.locator("span.math:not(:has(mjx-container)), div.math:not(:has(mjx-container))").count() == 0

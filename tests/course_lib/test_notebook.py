@@ -34,7 +34,14 @@ def test_live_and_check_cells_do_not_run():
 
 @pytest.mark.parametrize(
     "source",
-    ["%matplotlib inline\na = 1", "!pip install torch\na = 1", "a = 1\na?", "%%time\na = 1", "?print\na = 1", "%load_ext x\nif 1:\n    %time b\n    a = 1"],
+    [
+        "%matplotlib inline\na = 1",
+        "!pip install torch\na = 1",
+        "a = 1\na?",
+        "%%time\na = 1",
+        "?print\na = 1",
+        "%load_ext x\nif 1:\n    %time b\n    a = 1",
+    ],
 )
 def test_magics_are_dropped(source):
     namespace = new_namespace()
@@ -62,7 +69,9 @@ def test_classes_and_pickles_find_their_main_module():
     assert namespace["value"] == 1
 
 
-@pytest.mark.parametrize("content", ["", "{}", "[1]", '{"cells": [1]}', '{"cells": 3}', "[" * 100_000, '{"cells": [{"cell_type": "code"}]}'])
+@pytest.mark.parametrize(
+    "content", ["", "{}", "[1]", '{"cells": [1]}', '{"cells": 3}', "[" * 100_000, '{"cells": [{"cell_type": "code"}]}']
+)
 def test_what_is_no_notebook_is_refused(tmp_path, content):
     path = tmp_path / "x.ipynb"
     path.write_text(content)
@@ -77,5 +86,8 @@ def test_a_missing_file_is_named(tmp_path):
 
 def test_sources_may_be_lists_and_files_may_begin_with_a_byte_order_mark(tmp_path):
     path = tmp_path / "x.ipynb"
-    path.write_text("\ufeff" + json.dumps({"cells": [{"cell_type": "code", "source": ["a = 1\n", "b = 2"], "metadata": {}}]}), encoding="utf-8")
+    path.write_text(
+        "\ufeff" + json.dumps({"cells": [{"cell_type": "code", "source": ["a = 1\n", "b = 2"], "metadata": {}}]}),
+        encoding="utf-8",
+    )
     assert code_cells(path)[0]["source"] == "a = 1\nb = 2"

@@ -49,9 +49,18 @@ class Class:
         """`pick(index expression)` is the Python expression for an exercise's function, given the exercise's."""
         notebook = copy.deepcopy(self.released)
         for number, name in enumerate(EXERCISES):
-            graded_as(notebook, name).source = f"from autograder.checks.ch44 import EXERCISES\n{name} = {pick(f'EXERCISES[{number}]')}"
+            graded_as(
+                notebook, name
+            ).source = f"from autograder.checks.ch44 import EXERCISES\n{name} = {pick(f'EXERCISES[{number}]')}"
         folder = self.hand_in(student, notebook)
-        for module in ("autograder/__init__", "autograder/spec", "autograder/checks/__init__", "autograder/checks/ch44", "solutions/__init__", "solutions/ch44"):
+        for module in (
+            "autograder/__init__",
+            "autograder/spec",
+            "autograder/checks/__init__",
+            "autograder/checks/ch44",
+            "solutions/__init__",
+            "solutions/ch44",
+        ):
             (folder / module).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(ROOT / f"{module}.py", folder / f"{module}.py")
 
@@ -65,7 +74,9 @@ def graded(tmp_path_factory):
     robots.hand_in("perfect", robots.solved)
     robots.hand_in("blank", robots.released)
     for number in range(MISCONCEPTIONS):
-        robots.hand_in_functions(f"misconception-{number}", lambda e, n=number: f"{e}.misconceptions[{n} % len({e}.misconceptions)].function")
+        robots.hand_in_functions(
+            f"misconception-{number}", lambda e, n=number: f"{e}.misconceptions[{n} % len({e}.misconceptions)].function"
+        )
     for number in range(VARIANTS):
         robots.hand_in_functions(f"variant-{number}", lambda e, n=number: f"[*{e}.variants.values()][{n} % len({e}.variants)]")
     broken = copy.deepcopy(robots.solved)
@@ -86,7 +97,19 @@ def graded(tmp_path_factory):
     (robots.folder / "forgetful" / "ch44").mkdir(parents=True)
     (robots.folder / "lost" / "ch4").mkdir(parents=True)
     out = base / "grades"
-    command = [sys.executable, "-m", "autograder", "grade", str(robots.folder), "--out", str(out), "--jobs", "2", "--timeout", str(TIMEOUT)]
+    command = [
+        sys.executable,
+        "-m",
+        "autograder",
+        "grade",
+        str(robots.folder),
+        "--out",
+        str(out),
+        "--jobs",
+        "2",
+        "--timeout",
+        str(TIMEOUT),
+    ]
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=os.environ | {"COLUMNS": "200"})
     assert run.returncode == 0, run.stdout + run.stderr
     return out
@@ -164,7 +187,9 @@ def rows(path):
 def test_the_gradebook_and_the_tables_say_the_same_as_the_verdicts(graded):
     totals = {row["student_id"]: float(row["raw_score"]) for row in rows(graded / "grades.csv")}
     assert totals["perfect"] == 10.0 and totals["blank"] == 0.0 and totals["variant-0"] == 10.0
-    questions = [row for row in rows(graded / "questions.csv") if row["student"] == "misconception-0" and row["exercise"] == "compute_gae"]
+    questions = [
+        row for row in rows(graded / "questions.csv") if row["student"] == "misconception-0" and row["exercise"] == "compute_gae"
+    ]
     assert questions[0]["misconceptions"] == "truncated-treated-as-terminated" and float(questions[0]["score"]) == 0
 
 

@@ -1,0 +1,14 @@
+"""Removes all of nbgrader's metadata, as some editors do. Never a graded zero: a person looks at it, and the answers are judged
+meanwhile."""
+
+from pathlib import Path
+
+from nbformat import NotebookNode
+
+from tests.attacks.toolbox import write
+
+
+def make(folder: Path, notebook: NotebookNode) -> None:
+    for one in notebook.cells:
+        one.metadata.pop("nbgrader", None)
+    write(folder, notebook)
