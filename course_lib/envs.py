@@ -130,8 +130,9 @@ class BalanceTask:
         s' = drift * s + a + noise * w,   a ~ N(-obs @ gains, std²),   reward exp(-s'² / 2),   s_0 ~ N(0, start_std²)
 
     with w standard normal: the reward is 1 at zero and vanishes far from it. `obs` holds the position s and the readings of
-    `sensors` useless sensors, standard normal and fresh at every step. A policy is a pair of `gains`, a (1 + sensors,) tensor, and `std`.
-    Whatever it makes of the sensors acts like more noise, so every state is normal, and expected rewards have closed forms.
+    `sensors` useless sensors, standard normal and fresh at every step. A policy is given by its `gains`, a (1 + sensors,)
+    tensor, and its `std`. Whatever it makes of the sensors acts like more noise, so every state is normal, and expected
+    rewards have closed forms.
 
     Args:
       sensors: number of useless sensors.
@@ -177,7 +178,8 @@ class BalanceTask:
     def expected_advantage(self, new_gains, new_std, gains, std):
         """E A(s, a) over the states that (gains, std) visits and the actions of another policy there: a float.
 
-        A is the advantage of (gains, std). Kakade and Langford (2002), section 4: J(new) - J is the same over the new one's states.
+        A is the advantage of (gains, std). Over the new policy's own states the same mean would be exactly the difference of
+        their mean rewards: Kakade and Langford (2002), lemma 6.1.
         """
         states = self._state_variances(gains, std)
         weights = (1 - self.gamma) * self.gamma**self.times
@@ -191,7 +193,7 @@ class BalanceTask:
         return (self.drift - gains[0]) ** 2 * state_variances + gains[1:].square().sum() + std**2 + self.noise**2
 
     def _spread(self, gains, std):
-        """What t = 0, 1, … steps do to a position: its mean is multiplied by factors[t], and spreads[t] is added to its variance."""
+        """What t = 0, 1, … steps do to a position: its mean is multiplied by factors[t], its variance grows by spreads[t]."""
         factors = ((self.drift - float(gains[0])) ** self.times).clamp(-1e60, 1e60)  # beyond all reward, short of overflow
         added = self._landing_variances(gains, std, 0.0) * factors**2
         return factors, torch.cat([added.new_zeros(1), added.cumsum(0)[:-1]])

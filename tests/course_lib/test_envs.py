@@ -1,10 +1,11 @@
-"""The chain: Gymnasium's interface, same-step autoreset, and exact values that agree with what one measures."""
+"""Gymnasium's interface, same-step autoreset, and exact values that agree with what one measures."""
 
 import numpy as np
 import pytest
+import torch
 from gymnasium.vector import AutoresetMode
 
-from course_lib.envs import ChainVectorEnv
+from course_lib.envs import BalanceTask, ChainVectorEnv
 
 
 def quiet(**options):
@@ -83,3 +84,72 @@ def test_values_agree_with_simulated_returns():
 def test_impossible_options_are_refused_by_name(option, value):
     with pytest.raises(ValueError, match=f"{option}.*{value}"):
         ChainVectorEnv(**{option: value})
+
+
+GAINS, STD = torch.tensor([0.6, 0.2, -0.1]), 0.7
+
+
+def simulated_returns(task, positions, first_actions, num_steps=80):
+    """(1 - γ) Σ γ^t r_t of GAINS and STD, stepped one by one, for given first positions and actions."""
+    generator = torch.Generator().manual_seed(1)
+
+    def normal():
+        return torch.randn(len(positions), generator=generator)
+
+    returns, actions = torch.zeros(len(positions)), first_actions
+    for t in range(num_steps):
+        positions = task.drift * positions + actions + task.noise * normal()
+        returns += (1 - task.gamma) * task.gamma**t * (-(positions**2) / 2).exp()
+        actions = STD * normal() - GAINS[0] * positions - GAINS[1] * normal() - GAINS[2] * normal()
+    return returns
+
+
+def test_mean_reward_and_advantages_agree_with_a_simulation():
+    task, count = BalanceTask(sensors=2), 20_000
+    generator = torch.Generator().manual_seed(0)
+    obs = torch.randn(count, 3, generator=generator)
+    obs[:, 0] *= task.start_std
+    actions = STD * torch.randn(count, generator=generator) - obs @ GAINS
+    assert simulated_returns(task, obs[:, 0], actions).mean().item() == pytest.approx(task.mean_reward(GAINS, STD), abs=0.005)
+
+    state = torch.tensor([[1.0, 0.5, -0.5]])
+    pushes = {push: simulated_returns(task, torch.ones(count), torch.full((count,), push)).mean() for push in (-1.5, 0.5)}
+    exact = [task.advantages(state, torch.tensor([push]), GAINS, STD).item() for push in pushes]
+    assert exact[0] - exact[1] == pytest.approx((pushes[-1.5] - pushes[0.5]).item() / (1 - task.gamma), abs=0.03)
+
+
+def test_advantages_have_mean_zero_in_every_state():
+    task = BalanceTask(sensors=2)
+    obs = torch.tensor([[2.0, 1.0, -1.0]]).expand(100_000, 3)
+    actions = STD * torch.randn(100_000, generator=torch.Generator().manual_seed(0)) - obs @ GAINS
+    assert task.advantages(obs, actions, GAINS, STD).mean().item() == pytest.approx(0, abs=0.005)
+
+
+def test_expected_advantage_is_the_importance_weighted_mean_over_the_sample():
+    task, new_gains, new_std = BalanceTask(sensors=2), torch.tensor([0.7, 0.1, 0.0]), 0.65
+    obs, actions = task.sample(GAINS, STD, 200_000, torch.Generator().manual_seed(0))
+    new, old = (
+        torch.distributions.Normal(-(obs @ gains), std).log_prob(actions) for gains, std in ((new_gains, new_std), (GAINS, STD))
+    )
+    weighted = ((new - old).exp() * task.advantages(obs, actions, GAINS, STD)).mean().item()
+    assert task.expected_advantage(new_gains, new_std, GAINS, STD) == pytest.approx(weighted, abs=0.01)
+
+
+def test_expected_advantage_has_the_slope_of_the_mean_reward_at_the_policy_itself_and_only_there():
+    task, nearby, far = BalanceTask(), torch.tensor([0.601]), torch.tensor([1.2])
+    gains = torch.tensor([0.6])
+    assert task.expected_advantage(gains, STD, gains, STD) == 0
+    gained = {policy: task.mean_reward(policy, STD) - task.mean_reward(gains, STD) for policy in (nearby, far)}
+    assert task.expected_advantage(nearby, STD, gains, STD) == pytest.approx(gained[nearby], rel=0.01)
+    assert task.expected_advantage(far, STD, gains, STD) > 1.1 * gained[far]
+
+
+def test_an_unstable_controller_earns_next_to_nothing_and_stays_finite():
+    assert 0 <= BalanceTask().mean_reward(torch.tensor([50.0]), 1.0) < 0.05
+    assert torch.isfinite(BalanceTask().advantages(torch.ones(1, 1), torch.ones(1), torch.tensor([50.0]), 1.0)).all()
+
+
+@pytest.mark.parametrize("gamma", [0.0, 1.0, -0.5])
+def test_balance_refuses_discounts_without_a_finite_sum(gamma):
+    with pytest.raises(ValueError, match=f"gamma must lie in .*{gamma}"):
+        BalanceTask(gamma=gamma)
