@@ -1,5 +1,6 @@
 # make book    build book/_build/html/index.html          make test   all tests (installs Chromium and bubblewrap if it may)
 # make release write the students' bundle into release/   make check  style, types and the quick tests
+# make bench   how fast the grader is, beside stock nbgrader
 # The environment is .venv; it is brought up to date whenever the pins or pyproject.toml change.
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
@@ -9,7 +10,7 @@ WHOLE_MACHINE := tests/e2e tests/attacks tests/faults # they grade with a job fo
 TWO_AT_A_TIME := $(WHOLE_MACHINE:%=--ignore=%)
 QUICK := $(TWO_AT_A_TIME) --ignore=tests/book --ignore=tests/autograder/test_killmatrix.py
 
-.PHONY: book release test check install clean
+.PHONY: book release test check bench install clean
 
 book: install
 	$(BIN)/course book
@@ -27,6 +28,9 @@ check: install
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -q $(QUICK)
+
+bench: install
+	$(BIN)/python tools/bench_grading.py
 
 install: $(INSTALLED)
 

@@ -107,7 +107,7 @@ def grade(
     """Grade all submissions in a folder. Exit status: 0 all have a verdict, 1 below --fail-under, 2 bad input, 3 the grader failed."""
     from sqlalchemy.exc import SQLAlchemyError
 
-    from autograder import exports, grade, sandbox
+    from autograder import grade, sandbox
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=err, transient=True) as bar:
@@ -123,6 +123,8 @@ def grade(
         except (OSError, SQLAlchemyError) as error:  # a full disk, most likely; Python's own exit status would mean low scores
             bar.stop()
             _stop(f"the grades cannot be written: {error}. What is written is whole; mend this and grade again.", BROKEN)
+    from autograder import exports
+
     Console(highlight=False).print(exports.table(results))
     print(f"Grades are in {out}")
     if any(verdict.status == "infra_error" for verdict in results):

@@ -13,12 +13,18 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from nbformat import NotebookNode
 
-from autograder import assemble, chapter, exports, gradebook, intake, judge, sandbox, verdicts
+from autograder import assemble, chapter, intake, judge, sandbox, verdicts
 from autograder.verdicts import Verdict
 
+if TYPE_CHECKING:
+    from autograder.gradebook import GradebookWriter
+
+Task = tuple[str, str, Path]
+Judged = tuple[Verdict, NotebookNode | None]
 ATTEMPTS = 2  # a submission whose sandbox failed on our side is tried once more
 
 
@@ -55,33 +61,39 @@ def grade(
     if not trusted:
         sandbox.require()
     out.mkdir(parents=True, exist_ok=True)
-    known = {page.assignment: page for page in chapter.all_chapters()}
-    releases = {name: assemble.student_view(page) for name, page in known.items()}
-    with _one_run_at_a_time(out):
-        gradebook.write_course(out, releases, db_url)
-        with gradebook.GradebookWriter(db_url or f"sqlite:///{(out / 'gradebook.db').resolve()}") as book:
-            for name in {assignment for _, assignment, _ in tasks} & known.keys():
-                _register(book, name, releases[name])
-            results = []
-            judged = _on_dask(tasks, scheduler, timeout) if scheduler else _here(tasks, jobs, timeout, trusted)
-            for verdict, notebook in judged:
-                results.append(_write(verdict, notebook, out, book, releases))
-                progress(len(results), len(tasks), f"{verdict.student}/{verdict.assignment}")
-            try:
-                exports.write_all(out, book)
-            except ValueError as error:  # a verdict file that somebody has damaged
-                raise GradingError(str(error)) from None
+    judging = _on_dask(tasks, scheduler, timeout) if scheduler else _here(tasks, jobs, timeout, trusted)
+    with _one_run_at_a_time(out), judging as judged:
+        return _write_all(tasks, judged, out, db_url, progress)
+
+
+def _write_all(
+    tasks: list[Task], judged: Iterator[Judged], out: Path, db_url: str | None, progress: Callable[[int, int, str], None]
+) -> list[Verdict]:
+    """Write everything down, as the verdicts come in."""
+    from autograder import exports, gradebook  # nbgrader takes seconds to import, in which the first submissions are judged
+
+    releases = {page.assignment: assemble.student_view(page) for page in chapter.all_chapters()}
+    gradebook.write_course(out, releases, db_url)
+    results = []
+    with gradebook.GradebookWriter(db_url or f"sqlite:///{(out / 'gradebook.db').resolve()}") as book:
+        for name in {assignment for _, assignment, _ in tasks} & releases.keys():
+            _register(book, name, releases[name])
+        for verdict, notebook in judged:
+            results.append(_write(verdict, notebook, out, book, releases))
+            progress(len(results), len(tasks), f"{verdict.student}/{verdict.assignment}")
+        try:
+            exports.write_all(out, book)
+        except ValueError as error:  # a verdict file that somebody has damaged
+            raise GradingError(str(error)) from None
     return sorted(results, key=lambda verdict: (verdict.student, verdict.assignment))
 
 
-def judge_folder(
-    student: str, assignment: str, folder: Path, timeout: float, trusted: bool = False
-) -> tuple[Verdict, NotebookNode | None]:
+def judge_folder(student: str, assignment: str, folder: Path, timeout: float, trusted: bool = False) -> Judged:
     """Judge one submission, wherever this runs; our own failures become infra_error after a second attempt.
 
     Any exception is ours, and must not cost the others their grades.
     """
-    if assignment not in {page.assignment for page in chapter.all_chapters()}:
+    if assignment not in judge.assignments():
         return judge.unknown_assignment(intake.Submission(student, assignment, folder)), None
     submission = intake.read(student, assignment, folder)
     release = judge.released(assignment)
@@ -113,7 +125,7 @@ def _infra_error(submission: intake.Submission, release: judge.Released, failure
     )
 
 
-def _tasks(submitted: Path) -> list[tuple[str, str, Path]]:
+def _tasks(submitted: Path) -> list[Task]:
     if not submitted.is_dir():
         raise GradingError(f"{submitted}: no such folder. Give the folder that holds STUDENT/ASSIGNMENT/ASSIGNMENT.ipynb.")
     tasks = intake.discover(submitted)
@@ -122,51 +134,53 @@ def _tasks(submitted: Path) -> list[tuple[str, str, Path]]:
     return tasks
 
 
-def _register(book: gradebook.GradebookWriter, assignment: str, released: NotebookNode) -> None:
+def _register(book: GradebookWriter, assignment: str, released: NotebookNode) -> None:
     try:
         book.register(assignment, released)
     except ValueError as error:  # a cell that was withdrawn holds a score given by hand
         raise GradingError(f"{assignment}: {error}") from None
 
 
-def _here(
-    tasks: list[tuple[str, str, Path]], jobs: int, timeout: float, trusted: bool
-) -> Iterator[tuple[Verdict, NotebookNode | None]]:
-    # threads, for a verdict is made mostly by waiting; bubblewrap dies with the thread that started it, and these live to the end
-    with ThreadPoolExecutor(jobs) as pool:
-        futures = [pool.submit(judge_folder, *task, timeout, trusted) for task in tasks]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        finally:
-            pool.shutdown(cancel_futures=True)
+@contextmanager
+def _here(tasks: list[Task], jobs: int, timeout: float, trusted: bool) -> Iterator[Iterator[Judged]]:
+    """Judge on this machine, from the moment of entering, in threads: a verdict is made mostly by waiting."""
+    pool = ThreadPoolExecutor(jobs)  # bubblewrap dies with the thread that started it, and these live to the end
+    futures = [pool.submit(judge_folder, *task, timeout, trusted) for task in tasks]
+    try:
+        yield (future.result() for future in as_completed(futures))
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
-def _on_dask(tasks: list[tuple[str, str, Path]], scheduler: str, timeout: float) -> Iterator[tuple[Verdict, NotebookNode | None]]:
+@contextmanager
+def _on_dask(tasks: list[Task], scheduler: str, timeout: float) -> Iterator[Iterator[Judged]]:
+    """Judge on the workers of a Dask scheduler, which must see the same files."""
     from distributed import Client, as_completed  # a second of imports that a local run need not pay
 
     with Client(scheduler, timeout="30s") as client:
         futures = {
-            client.submit(judge_folder, student, assignment, folder.resolve(), timeout, pure=False, retries=1): (
-                student,
-                assignment,
-                folder,
-            )
-            for student, assignment, folder in tasks
+            client.submit(judge_folder, student, assignment, folder.resolve(), timeout, pure=False, retries=1): task
+            for task in tasks
+            for student, assignment, folder in [task]
         }
-        for future in as_completed(futures):
-            student, assignment, folder = futures[future]
-            if future.status == "finished":
-                yield future.result()
-            else:  # the worker died, twice
-                submission = intake.read(student, assignment, folder)
-                yield _infra_error(submission, judge.released(assignment), future.exception()), None
+
+        def judged() -> Iterator[Judged]:
+            for future in as_completed(futures):
+                if future.status == "finished":
+                    yield future.result()
+                else:  # the worker died, twice
+                    submission = intake.read(*futures[future])
+                    yield _infra_error(submission, judge.released(submission.assignment), future.exception()), None
+
+        yield judged()
 
 
 def _write(
-    verdict: Verdict, notebook: NotebookNode | None, out: Path, book: gradebook.GradebookWriter, releases: dict[str, NotebookNode]
+    verdict: Verdict, notebook: NotebookNode | None, out: Path, book: GradebookWriter, releases: dict[str, NotebookNode]
 ) -> Verdict:
     """Gradebook first, then the notebook that formgrader shows, then the verdict, which says that the rest is done."""
+    from autograder import gradebook
+
     if verdict.assignment in releases:
         previous = gradebook.read_autograded(out, verdict.student, verdict.assignment)
         book.record(verdict, notebook, previous)

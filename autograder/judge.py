@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import re
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -51,9 +52,23 @@ class Released:
     environment: str
 
 
+_PREPARING = threading.Lock()
+
+
 @functools.cache
+def assignments() -> frozenset[str]:
+    """The assignments that there are."""
+    return frozenset(page.assignment for page in chapter.all_chapters())
+
+
 def released(assignment: str) -> Released:
-    """The release of an assignment. Raises chapter.ChapterError or KeyError-like errors if there is no such chapter."""
+    """The release of an assignment, prepared once a process. Raises ValueError if there is no such chapter."""
+    with _PREPARING:
+        return _released(assignment)
+
+
+@functools.cache
+def _released(assignment: str) -> Released:
     page = chapter.load(assignment)
     outline = assemble.assignment(page)
     exercises = tuple(freeze.complete(exercise) for exercise in checks.exercises(assignment))

@@ -29,7 +29,7 @@ import torch  # noqa: E402
 
 from course_lib.cases import decode, encode  # noqa: E402
 from course_lib.notebook import new_namespace, run_cell  # noqa: E402
-from course_lib.runner import observe  # noqa: E402
+from course_lib.runner import observe, text_of  # noqa: E402
 
 ANSWERED = 86  # how a child ends that has answered; os._exit(0) in a learner's function is no answer
 
@@ -67,7 +67,7 @@ def load(channel: Channel, cells: list) -> dict:
         try:
             run_cell(source, namespace, f"cell {number}")
         except BaseException as error:  # whatever a cell raises, the next one runs
-            failures[number] = f"{type(error).__name__}: {error!s:.300}"
+            failures[number] = f"{type(error).__name__}: {text_of(error)}"
     channel.send({"loaded": failures})
     return namespace
 

@@ -38,7 +38,7 @@ def observe(function: Callable, arguments: Mapping[str, Any], differentiate: Seq
             warnings.simplefilter("ignore")
             returned = _call(function, given)
     except Exception as error:
-        return Observation(error=type(error).__name__, message=_text(error), mutated=_changed(given, before))
+        return Observation(error=type(error).__name__, message=text_of(error), mutated=_changed(given, before))
     kind, tensors = _tensors(returned)
     return Observation(
         kind=kind,
@@ -99,8 +99,9 @@ def _same(new: torch.Tensor, old: torch.Tensor) -> bool:
     return new.dtype == old.dtype and new.shape == old.shape and torch.equal(new.nan_to_num(), old.nan_to_num())
 
 
-def _text(error: Exception) -> str:
+def text_of(error: BaseException) -> str:
+    """What the exception says, or nothing if it refuses to say it."""
     try:
         return str(error)[:500]
-    except Exception:
+    except BaseException:
         return ""

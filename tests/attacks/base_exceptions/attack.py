@@ -1,4 +1,4 @@
-"""Raises what `except Exception` does not catch, with a text that raises in turn. The cell is left out; the others count."""
+"""Raises what `except Exception` does not catch, with a text that raises in turn. It fails like any other cell."""
 
 from pathlib import Path
 
