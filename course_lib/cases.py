@@ -77,8 +77,8 @@ class FrozenExercise:
     name: str
     criteria: dict[str, float]
     messages: dict[str, str]
-    signatures: dict[str, list[str]]
     cases: list[FrozenCase]
+    signatures: dict[str, list[str]] = field(default_factory=dict)
     axes: list[str] = field(default_factory=list)
     last_step_first: bool = False
 

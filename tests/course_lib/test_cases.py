@@ -63,7 +63,7 @@ def test_an_exercise_survives_its_file(tmp_path):
         ["x"],
     )
     exercise = FrozenExercise(
-        "f", {"values": 1.5, "errors": 0.5}, {"wrong": "look here"}, {"wrong": ["values"]}, [case], ["t"], True
+        "f", {"values": 1.5, "errors": 0.5}, {"wrong": "look here"}, [case], {"wrong": ["values"]}, ["t"], True
     )
     save(tmp_path / "f.npz", exercise)
     back = load(tmp_path / "f.npz")
@@ -80,7 +80,7 @@ def test_an_exercise_survives_its_file(tmp_path):
 
 
 def test_a_frozen_file_is_the_same_each_time(tmp_path):
-    exercise = FrozenExercise("f", {"values": 1.0}, {}, {}, [FrozenCase("c", {"x": np.ones(3)}, [Observation()])])
+    exercise = FrozenExercise("f", {"values": 1.0}, {}, [FrozenCase("c", {"x": np.ones(3)}, [Observation()])])
     save(tmp_path / "a.npz", exercise)
     save(tmp_path / "b.npz", exercise)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
