@@ -120,6 +120,8 @@ def _cell(cell: Any) -> dict[str, Any]:
     plain: dict[str, Any] = {"cell_type": kind, "source": source, "metadata": metadata if isinstance(metadata, dict) else {}}
     if not isinstance(plain["metadata"].get("nbgrader", {}), dict):
         del plain["metadata"]["nbgrader"]
+    if isinstance(cell.get("id"), str):
+        plain["id"] = cell["id"]
     return plain | ({"outputs": [], "execution_count": None} if kind == "code" else {})
 
 

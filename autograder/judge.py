@@ -49,6 +49,7 @@ class Released:
     open_questions: tuple[tuple[str, float], ...]
     grade_ids: frozenset[str]
     live_sources: frozenset[str]
+    live_ids: frozenset[str]
     environment: str
 
 
@@ -75,9 +76,15 @@ def _released(assignment: str) -> Released:
     names = {exercise.name for exercise in exercises}
     tests = {f"test_{name}" for name in names}
     questions = {name for name, _ in outline.open_questions}
-    live = frozenset(_squeezed(cell.source) for cell in page.cells if cell.kind == "code" and "live" in cell.tags)
+    live = [cell for cell in assemble.student_view(page).cells if cell.cell_type == "code" and is_live(cell)]
     return Released(
-        assignment, exercises, tuple(outline.open_questions), frozenset(names | tests | questions), live, environment()
+        assignment,
+        exercises,
+        tuple(outline.open_questions),
+        frozenset(names | tests | questions),
+        frozenset(_squeezed(cell.source) for cell in live),
+        frozenset(cell.id for cell in live),
+        environment(),
     )
 
 
@@ -159,10 +166,16 @@ def runnable(notebook: Any, release: Released) -> list[tuple[int, str]]:
     cells = []
     for number, cell in enumerate((cell for cell in notebook.cells if cell.cell_type == "code"), start=1):
         is_answer = cell.metadata.get("nbgrader", {}).get("solution") is True
-        skipped = is_check(cell) or is_live(cell) or _squeezed(cell.source) in release.live_sources
-        if is_answer or not skipped:
+        if is_answer or not (is_check(cell) or _is_released_live(cell, release)):
             cells.append((number, cell.source))
     return cells
+
+
+def _is_released_live(cell: Any, release: Released) -> bool:
+    """A copy of a live cell keeps its tag, and may hold a learner's helpers: the tag counts only where the cells' ids are lost."""
+    if _squeezed(cell.source) in release.live_sources:
+        return True
+    return cell.id in release.live_ids if "id" in cell else is_live(cell)
 
 
 def _squeezed(source: str) -> str:

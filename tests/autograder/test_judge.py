@@ -3,6 +3,7 @@
 import json
 import time
 
+import nbformat
 import numpy as np
 import pytest
 import safetensors.numpy
@@ -14,7 +15,7 @@ from course_lib.cases import FrozenCase, FrozenExercise, Observation, encode
 EXERCISE = FrozenExercise(
     "f", {"values": 1.0}, {}, [FrozenCase("one", {}, [Observation(kind="tensor", outputs={"": np.ones(2)})])]
 )
-RELEASE = judge.Released("ch99", (EXERCISE,), (), frozenset(), frozenset(), "")
+RELEASE = judge.Released("ch99", (EXERCISE,), (), frozenset(), frozenset({"train()"}), frozenset({"ch99-001"}), "")
 
 
 class Scripted:
@@ -121,3 +122,24 @@ def test_looking_for_a_definition_takes_no_longer_for_a_hostile_cell(source):
 @pytest.mark.parametrize("source", ["def f(x):", "if x:\n\tdef  f (x):", "async def f():", "class f:", "f = g", "f: int = 3"])
 def test_definitions_are_found(source):
     assert judge._last_definition("f", [(1, source), (2, "f == 1")]) == 0
+
+
+def _cells(*cells):
+    return nbformat.from_dict({"cells": [{"cell_type": "code", "metadata": {}, "source": "", **cell} for cell in cells]})
+
+
+def test_released_live_cells_do_not_run_even_if_edited_or_stripped_of_their_tags():
+    live = {"metadata": {"tags": ["live"]}}
+    edited, stripped, without_ids = (
+        {"id": "ch99-001", "source": "train(5)"},
+        {"source": "train( )"},
+        {**live, "source": "train(6)"},
+    )
+    assert judge.runnable(_cells(edited, stripped, without_ids), RELEASE) == []
+
+
+def test_added_cells_and_answers_run_though_a_copy_has_kept_a_tag():
+    live = {"tags": ["live"]}
+    copied = {"id": "new", "metadata": live, "source": "def helper(): pass"}
+    answer = {"id": "ch99-002", "metadata": live | {"nbgrader": {"solution": True}}, "source": "def f(): pass"}
+    assert [source for _, source in judge.runnable(_cells(copied, answer), RELEASE)] == ["def helper(): pass", "def f(): pass"]
