@@ -53,7 +53,7 @@ def build(with_solutions: bool = True, out: Path | None = None) -> Path:
     Raises: BookError if a cell fails, or Sphinx warns.
     """
     out = Path(out or BOOK / "_build" / "html").resolve()
-    with _one_build_at_a_time():
+    with _one_at_a_time("build"):
         chapters = all_chapters()
         key = _build_key(chapters, with_solutions)
         if _is_current(out, key):
@@ -156,13 +156,16 @@ def kill_rows(chapter: Chapter) -> list[dict]:
     cached = (
         cache_folder() / f"{chapter.assignment}-{content_hash([], [*library, *own, ROOT / 'autograder' / 'killmatrix.py'])}.json"
     )
-    if not cached.exists():
-        print(f"{chapter.assignment}: testing its checks against wrong and right answers (minutes, the first time)", flush=True)
-        names = [str(cell.exercise) for cell in chapter.exercises]
-        with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
-            rows = list(pool.map(_exercise_rows, [chapter.assignment] * len(names), names))
-        replace_cached(cached, json.dumps(rows))
-    return json.loads(cached.read_text(encoding="utf-8"))
+    with _one_at_a_time("kill-matrix"):
+        if not cached.exists():
+            print(
+                f"{chapter.assignment}: testing its checks against wrong and right answers (minutes, the first time)", flush=True
+            )
+            names = [str(cell.exercise) for cell in chapter.exercises]
+            with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
+                rows = list(pool.map(_exercise_rows, [chapter.assignment] * len(names), names))
+            replace_cached(cached, json.dumps(rows))
+        return json.loads(cached.read_text(encoding="utf-8"))
 
 
 def _exercise_rows(assignment: str, name: str) -> dict:
@@ -269,8 +272,8 @@ def _listing(folder: Path) -> dict[str, list[int]]:
 
 
 @contextmanager
-def _one_build_at_a_time() -> Iterator[None]:
-    """Wait for another build of this checkout: both would write the same staging folder."""
-    with open(cache_folder() / "lock", "w") as lock:
+def _one_at_a_time(work: str) -> Iterator[None]:
+    """Wait for another process that does the same work in this checkout: both would write the same files."""
+    with open(cache_folder() / f"{work}.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield
