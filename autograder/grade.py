@@ -58,8 +58,12 @@ def grade(
     Raises: GradingError if there is nothing to grade; sandbox.SandboxUnavailable if no sandbox can be had.
     """
     tasks = _tasks(submitted)
-    if not trusted:
-        sandbox.require()
+    wanted = {assignment for _, assignment, _ in tasks} & judge.assignments()
+    with ThreadPoolExecutor(1) as early:  # freezing the checks takes a second or two, in which the sandbox is tried
+        for name in wanted:
+            early.submit(judge.released, name)
+        if not trusted:
+            sandbox.require()
     out.mkdir(parents=True, exist_ok=True)
     judging = _on_dask(tasks, scheduler, timeout) if scheduler else _here(tasks, jobs, timeout, trusted)
     with _one_run_at_a_time(out), judging as judged:

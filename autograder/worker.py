@@ -14,6 +14,7 @@ The conversation, in frames of course_lib.cases.encode, over the stream socket w
 Each exercise is called in a forked child, so that what it does to its process is gone with it.
 """
 
+import gc
 import os
 import select
 import signal
@@ -25,11 +26,14 @@ from dataclasses import asdict
 # *.dist-info on the path announces (torch.backends), and a learner's file of that name would run before the judge counts on it.
 HANDED_IN = sys.path.pop()  # the sandbox names it last
 
+gc.disable()  # while hundreds of modules are made, there is nothing to collect; importing torch is most of a grading's cost
 import torch  # noqa: E402
 
 from course_lib.cases import decode, encode  # noqa: E402
 from course_lib.notebook import new_namespace, run_cell  # noqa: E402
 from course_lib.runner import observe, text_of  # noqa: E402
+
+gc.enable()
 
 ANSWERED = 86  # how a child ends that has answered; os._exit(0) in a learner's function is no answer
 
