@@ -35,7 +35,8 @@ from autograder.paths import ROOT
 from course_lib import checking
 
 BLOCK = re.compile(
-    r"^(?P<fence>`{3,})(?P<kind>console|pycon|\{code-block\}[^\n]*)\n(?P<body>.*?)^(?P=fence)$|^% solve (?P<solve>[^\n]*)$", re.M | re.S
+    r"^(?P<fence>`{3,})(?P<kind>console|pycon|\{code-block\}[^\n]*)\n(?P<body>.*?)^(?P=fence)$|^% solve (?P<solve>[^\n]*)$",
+    re.M | re.S,
 )
 SOURCES = ("autograder", "book", "chapters", "course_lib", "solutions", "tests", "pyproject.toml", "requirements.txt")
 
@@ -139,7 +140,11 @@ def test_the_contributors_page(reader):
     page = reader("contributors")
     for name in SOURCES:
         if (ROOT / name).is_dir():
-            shutil.copytree(ROOT / name, page.folder / name, ignore=shutil.ignore_patterns("_build", "_stage", "_cache", "frozen", "__pycache__"))
+            shutil.copytree(
+                ROOT / name,
+                page.folder / name,
+                ignore=shutil.ignore_patterns("_build", "_stage", "_cache", "frozen", "__pycache__"),
+            )
         else:
             shutil.copy(ROOT / name, page.folder)
     page.run()
