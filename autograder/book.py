@@ -38,6 +38,7 @@ from autograder.paths import COURSE_LIB, ROOT
 BOOK = ROOT / "book"
 STAGE = BOOK / "_stage"
 PUBLISHED = ("*.html", "searchindex.js", "_static/*", "_images/*", "_downloads/*")
+HOW_TO = ("how-to/learners", "how-to/teachers", "how-to/contributors")
 MATHJAX = ("tex-chtml-full.js", "output/chtml/fonts/**/*", "a11y/*", "sre/**/*")
 # The library's modules that decide a kill matrix: it takes minutes, so a new plot must not ask for it again.
 JUDGING = ("cases", "diagnosis", "runner", "validate")
@@ -76,7 +77,8 @@ def build(with_solutions: bool = True, out: Path | None = None) -> Path:
 
 def staged_files(chapters: list[Chapter], with_solutions: bool) -> dict[str, bytes]:
     """Everything that Sphinx reads, by path relative to the staging folder."""
-    files = {path.name: path.read_bytes() for path in [*BOOK.glob("*.md"), *BOOK.glob("*.bib")]}
+    pages = [*BOOK.glob("*.md"), *BOOK.glob("how-to/*.md"), *BOOK.glob("*.bib")]
+    files = {path.relative_to(BOOK).as_posix(): path.read_bytes() for path in pages}
     files["index.md"] = _front_page(files["index.md"].decode(), chapters).encode()
     files["notation.md"] = notation_page(yaml.safe_load((BOOK / "notation.yml").read_text(encoding="utf-8"))).encode()
     files["_toc.yml"] = yaml.safe_dump(table_of_contents(chapters), sort_keys=False, allow_unicode=True).encode()
@@ -103,7 +105,8 @@ def table_of_contents(chapters: list[Chapter]) -> dict:
     """sphinx-external-toc's table, from the chapters' front matter."""
     entries = [{"file": docname(chapter), "title": f"{chapter.number}. {chapter.title}"} for chapter in chapters]
     appendices = [{"file": "notation"}, {"file": "kill-matrix"}]
-    parts = [{"caption": "Chapters", "chapters": entries}, {"caption": "Appendices", "chapters": appendices}]
+    how_to = {"caption": "How to use this book", "chapters": [{"file": page} for page in HOW_TO]}
+    parts = [how_to, {"caption": "Chapters", "chapters": entries}, {"caption": "Appendices", "chapters": appendices}]
     return {"format": "jb-book", "root": "index", "parts": parts}
 
 

@@ -110,7 +110,8 @@ def grade(
     from autograder import grade, sandbox
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=err, transient=True) as bar:
+    # away from a terminal it would leave an empty line
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task("grading", total=None)
         try:
             results = grade.grade(

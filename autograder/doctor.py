@@ -105,7 +105,9 @@ def _nbgrader() -> Check:
 
 def _frozen() -> Check:
     count = len(list((ROOT / "course_lib" / "frozen").glob("*.npz")))
-    remedy = "" if count else "Nothing to do: releasing or building freezes them. Until then check() in a notebook finds none."
+    remedy = (
+        "" if count else "Nothing to do: `course check` and the first build of the book freeze them, and a bundle has its own."
+    )
     return Check("frozen checks", count > 0, f"{count} exercises", remedy, required=False)
 
 

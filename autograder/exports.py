@@ -181,7 +181,10 @@ def gradescope_json(verdict: Verdict) -> str:
 def _overview(verdict: Verdict) -> tuple[str, str, str, str, str]:
     score = "–" if verdict.status == "infra_error" else f"{points(verdict.score)} / {points(verdict.max_score)}"
     states = Counter(STATE_WORDS[item.state] for item in verdict.items)
-    notes = "; ".join([*(f"{count} {state}" for state, count in states.items()), *verdict.flags])
+    outcome = [f"{count} {state}" for state, count in states.items()]
+    if verdict.status == "student_error":  # nothing ran, and one reason holds for all: a teacher can act on that, not on counts
+        outcome = list(dict.fromkeys(item.message for item in verdict.automatic if item.message))
+    notes = "; ".join([*outcome, *verdict.flags])
     return verdict.student, verdict.assignment, verdict.status.replace("_", " "), score, clean_text(notes.replace("\n", " "), 300)
 
 

@@ -16,6 +16,8 @@ from autograder.chapter import parse
 from autograder.contract import references
 from autograder.paths import ROOT
 
+HOW_TO_PAGES = sorted((ROOT / "book" / "how-to").glob("*.md"))
+
 
 @pytest.fixture
 def elsewhere(tmp_path, monkeypatch):
@@ -115,7 +117,8 @@ def test_outputs_are_those_of_each_code_cell_and_come_from_the_cache_the_second_
 
 def test_table_of_contents_comes_from_the_front_matter(tiny):
     toc = book.table_of_contents([tiny.before, tiny.chapter])
-    [chapters, appendices] = toc["parts"]
+    [how_to, chapters, appendices] = toc["parts"]
+    assert sorted(f"{entry['file']}.md" for entry in how_to["chapters"]) == [f"how-to/{path.name}" for path in HOW_TO_PAGES]
     assert [entry["file"] for entry in chapters["chapters"]] == ["chapters/ch98_before", "chapters/ch99_tiny"]
     assert chapters["chapters"][1]["title"] == f"99. {tiny.chapter.title}"
     assert [entry["file"] for entry in appendices["chapters"]] == ["notation", "kill-matrix"]
@@ -195,6 +198,7 @@ def test_only_pages_and_what_they_show_is_published(bare):
         "kill-matrix.html",
         "search.html",
         "searchindex.js",
+        "how-to",
         "chapters",
         "_static",
         "_images",

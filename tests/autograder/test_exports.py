@@ -201,6 +201,14 @@ def test_terminal_table_shows_names_as_they_are():
     assert "[red]x" in text and "5 / 5" in text and "2 correct" in text and "infra error" in text
 
 
+def test_terminal_table_says_why_a_submission_could_not_be_graded():
+    console = Console(file=io.StringIO(), width=200)
+    item = {"score": 0.0, "max_score": 1.0, "state": "error", "message": "There is no notebook."}
+    items = [item | {"exercise": name} for name in ("first", "second")]
+    console.print(exports.table([verdict(status="student_error", score=0.0, items=items)]))
+    assert console.file.getvalue().count("There is no notebook.") == 1
+
+
 def test_summary_is_a_markdown_table_of_bounded_length():
     text = exports.summary_markdown([verdict("a|b <img> _x_", flags=["`@all`\n| x"])])
     assert text.startswith("**Submissions: 1** (1 graded)")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from autograder.book import docname
+from autograder.book import HOW_TO, docname
 from autograder.chapter import all_chapters
 from autograder.contract import references, sources
 
@@ -16,7 +16,7 @@ LOOKS = {  # colour scheme, width in CSS pixels
     "dark": ("dark", 1280),
     "phone": ("light", 390),
 }
-PAGES = ["index", "notation", "kill-matrix", *(docname(chapter) for chapter in all_chapters())]
+PAGES = ["index", *HOW_TO, "notation", "kill-matrix", *(docname(chapter) for chapter in all_chapters())]
 CHAPTERS = [page for page in PAGES if page.startswith("chapters/")]
 
 
