@@ -182,8 +182,8 @@ def _front_page(text: str, chapters: list[Chapter]) -> str:
 
 
 def _assets() -> dict[str, bytes]:
-    """Our style sheet, and MathJax from its package, under a name other than _static, which Jupyter Book treats specially."""
-    files = {f"vendor/{path.name}": path.read_bytes() for path in (BOOK / "static").glob("*.css")}
+    """Our style sheet and scripts, and MathJax from its package, under a name other than _static, which Jupyter Book treats specially."""
+    files = {f"vendor/{path.name}": path.read_bytes() for path in (BOOK / "static").iterdir() if path.suffix in (".css", ".js")}
     package = importlib.util.find_spec("sphinx-mathjax-offline")  # a name that no import statement can spell
     if package is None or not package.submodule_search_locations:
         raise BookError("sphinx-mathjax-offline is not installed: run `make install`")

@@ -126,7 +126,7 @@ def _frames(data: dict) -> str:
     frames = []
     for panel in data["panels"]:
         names = [(i, html.escape(data["series"][i]["name"])) for i in panel["series"]]
-        key = "".join(f'<span class="key c{i % 5}" aria-hidden="true"></span>{name}' for i, name in names)
+        key = "".join(f'<span class="entry"><span class="key c{i % 5}" aria-hidden="true"></span>{name}</span>' for i, name in names)
         label = html.escape(panel["label"])
         frames.append(f'<p class="panel">{label}:{key}</p><div><svg role="img" aria-label="{label}"></svg></div>')
     return "".join(frames)
