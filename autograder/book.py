@@ -236,6 +236,8 @@ def _publish(html: Path, out: Path) -> None:
         if path.is_file() and wanted and (not name.startswith("_images/") or path.name in images):
             (fresh / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, fresh / name)
+    for page in fresh.rglob("*.html"):  # docutils gives the entries of a list a role that is deprecated, and no list item
+        page.write_text(page.read_text(encoding="utf-8").replace(' role="doc-biblioentry"', ' role="listitem"'), encoding="utf-8")
     if out.exists():
         out.rename(former)
     fresh.rename(out)

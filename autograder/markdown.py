@@ -146,7 +146,7 @@ class Book(Dialect):
         return f"{block.fence}{{{block.kind}}} {title}".rstrip() + f"\n{options}\n{body}\n{block.fence}"
 
     def quiz(self, block: Block, question: str, body: str, choices: list[Choice]) -> str:
-        # Two lists of equal length, the second folded, which book/static/quiz.js makes a form of; without it they read as they are
+        # Two lists of equal length, the second folded, which book/static/course.js makes a form of; without it they read as they are
         answers = "\n".join(f"1. {choice.text}" for choice in choices)
         mark = '<strong class="quiz-{}">{}</strong>'
         explanations = "\n".join(

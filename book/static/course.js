@@ -1,3 +1,12 @@
+// Paper is white, whatever the screen is.
+const paper = matchMedia("print");
+let screenTheme;
+paper.addEventListener("change", () => {
+  const root = document.documentElement;
+  if (paper.matches) screenTheme = root.dataset.theme;
+  root.dataset.theme = paper.matches ? "light" : screenTheme;
+});
+
 // Makes a form of each quiz. The page holds the question, the answers as one list and the explanations as a second, folded one
 // (autograder/markdown.py); what Sphinx and MathJax have rendered is moved, never copied. Without this script the fold remains.
 document.querySelectorAll("div.quiz").forEach((quiz, number) => {
