@@ -188,8 +188,8 @@ def _front_page(text: str, chapters: list[Chapter]) -> str:
 
 
 def _assets() -> dict[str, bytes]:
-    """Our style sheet, and MathJax from its package, under a name other than _static, which Jupyter Book treats specially."""
-    files = {f"vendor/{path.name}": path.read_bytes() for path in (BOOK / "static").glob("*.css")}
+    """Our style sheet and scripts, and MathJax from its package, under a name other than _static, which Jupyter Book treats specially."""
+    files = {f"vendor/{path.name}": path.read_bytes() for path in (BOOK / "static").iterdir() if path.suffix in (".css", ".js")}
     package = importlib.util.find_spec("sphinx-mathjax-offline")  # a name that no import statement can spell
     if package is None or not package.submodule_search_locations:
         raise BookError("sphinx-mathjax-offline is not installed: run `make install`")
@@ -242,6 +242,8 @@ def _publish(html: Path, out: Path) -> None:
         if path.is_file() and wanted and (not name.startswith("_images/") or path.name in images):
             (fresh / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, fresh / name)
+    for page in fresh.rglob("*.html"):  # docutils gives the entries of a list a role that is deprecated, and no list item
+        page.write_text(page.read_text(encoding="utf-8").replace(' role="doc-biblioentry"', ' role="listitem"'), encoding="utf-8")
     if out.exists():
         out.rename(former)
     fresh.rename(out)

@@ -11,18 +11,20 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from string import ascii_uppercase
 from typing import ClassVar
 
 from autograder.references import References
 
 ADMONITIONS = {"note": "Note", "tip": "Tip", "warning": "Warning", "important": "Important"}
-DIRECTIVES = {*ADMONITIONS, "admonition", "dropdown", "margin", "math"}
+DIRECTIVES = {*ADMONITIONS, "admonition", "dropdown", "margin", "math", "quiz"}
 OPTIONS = {"class", "open", "label"}
 
 _CODE_FENCE = re.compile(r"\s*(?:>\s*)*(?P<fence>`{3,}|~{3,})(?P<info>.*)")
 _DIRECTIVE = re.compile(r"(?P<fence>:{3,})\{(?P<name>[^}]*)\}\s*(?P<argument>.*?)\s*")
 _OPTION = re.compile(r":(?P<key>[\w-]+):\s*(?P<value>.*?)\s*")
 _MATH = re.compile(r"(?P<indent>[ \t]*)\$\$(?P<body>.*?)\$\$[ \t]*(?:\((?P<label>[\w:-]+)\))?[ \t]*", re.DOTALL)
+_CHOICE = re.compile(r"- \[(?P<mark>[ x])\] +(?P<text>\S.*)")
 _INLINE = re.compile(
     r"\{(?P<role>[A-Za-z][\w:+-]*)\}`(?P<content>[^`]+)`"
     r"|(?P<ticks>`+)(?!`).+?(?<!`)(?P=ticks)(?!`)"
@@ -67,6 +69,20 @@ class Block:
         return self.options.get("label")
 
 
+@dataclass(frozen=True)
+class Choice:
+    """One answer that a quiz offers, and what is said to whoever chooses it."""
+
+    text: str
+    explanation: str
+    right: bool
+
+    @property
+    def verdict(self) -> str:
+        """The first word of the explanation, since colour alone would not reach everybody."""
+        return "Right." if self.right else "Wrong."
+
+
 class Dialect(ABC):
     """How one kind of page writes what is not plain Markdown. `cited` collects the keys that a text cites, in order."""
 
@@ -97,6 +113,10 @@ class Dialect(ABC):
         """One directive whose body and argument are rendered already."""
 
     @abstractmethod
+    def quiz(self, block: Block, question: str, body: str, choices: list[Choice]) -> str:
+        """A question with answers to choose from, all rendered already; `body` is what stands between them, or empty."""
+
+    @abstractmethod
     def math(self, block: Block) -> str:
         """A displayed equation."""
 
@@ -124,6 +144,17 @@ class Book(Dialect):
         names = {"class": "class-container"} if block.kind == "dropdown" else {}  # sphinx-design's own name for it
         options = "".join(f":{names.get(key, key)}: {value}".rstrip() + "\n" for key, value in block.options.items())
         return f"{block.fence}{{{block.kind}}} {title}".rstrip() + f"\n{options}\n{body}\n{block.fence}"
+
+    def quiz(self, block: Block, question: str, body: str, choices: list[Choice]) -> str:
+        # Two lists of equal length, the second folded, which book/static/course.js makes a form of; without it they read as they are
+        answers = "\n".join(f"1. {choice.text}" for choice in choices)
+        mark = '<strong class="quiz-{}">{}</strong>'
+        explanations = "\n".join(
+            f"1. {mark.format('right' if choice.right else 'wrong', choice.verdict)} {choice.explanation}" for choice in choices
+        )
+        fold = f"```{{dropdown}} Answer\n{explanations}\n```"
+        parts = [f"{block.fence}{{div}} quiz", question, body, answers, fold]
+        return "\n\n".join(part for part in parts if part) + f"\n{block.fence}"
 
     def math(self, block: Block) -> str:
         if not block.label:
@@ -171,6 +202,13 @@ class Plain(Dialect):
         heading = f"**{title}**\n\n" if title else ""
         return _quoted(heading + body)
 
+    def quiz(self, block: Block, question: str, body: str, choices: list[Choice]) -> str:
+        lettered = [(f"- **{letter}.**", choice) for letter, choice in zip(ascii_uppercase, choices, strict=False)]
+        answers = "\n".join(f"{letter} {choice.text}" for letter, choice in lettered)
+        explanations = "\n".join(f"{letter} **{choice.verdict}** {choice.explanation}" for letter, choice in lettered)
+        fold = f"<details>\n<summary>Answer</summary>\n\n{explanations}\n\n</details>"
+        return "\n\n".join(part for part in [f"**Question.** {question}", body, answers, fold] if part)
+
     def math(self, block: Block) -> str:
         tag = f"\n\\tag{{{self.equations[block.label]}}}" if block.label else ""
         return _display(block.text + tag, block.indent)
@@ -209,8 +247,43 @@ def _rendered(block: Block, dialect: Dialect) -> str:
         return _inline(block.text, dialect, block.line)
     if block.kind == "math":
         return dialect.math(block)
+    if block.kind == "quiz":
+        return _quiz(block, dialect)
     body = render(block.text, dialect, block.body_line)
     return dialect.directive(block, body.strip("\n"), _inline(block.argument, dialect, block.line))
+
+
+def _quiz(block: Block, dialect: Dialect) -> str:
+    """A quiz: its question in the argument, perhaps more of it in the body, then `- [ ] answer: explanation`, one of them `[x]`."""
+    lines = block.text.rstrip().split("\n")
+    begin = next((at for at, line in enumerate(lines) if line.startswith("- [")), len(lines))
+    choices: list[tuple[int, bool, str]] = []
+    for number, line in enumerate(lines[begin:], block.body_line + begin):
+        if match := _CHOICE.fullmatch(line):
+            choices.append((number, match["mark"] == "x", match["text"]))
+        elif line.startswith("  ") and choices:
+            choices[-1] = (*choices[-1][:2], f"{choices[-1][2]} {line.strip()}")
+        elif line.strip():
+            raise MarkdownError(number, "an answer of a quiz is `- [ ] answer: explanation`, or [x] for the right one")
+    right = [number for number, is_right, _ in choices if is_right]
+    if not block.argument:
+        raise MarkdownError(block.line, "a quiz has its question on its first line, :::{quiz} Which …?")
+    if len(choices) < 2:
+        raise MarkdownError(block.line, "a quiz needs at least two answers, lines of `- [ ] answer: explanation`")
+    if len(right) != 1:
+        here = right[1] if right else block.line
+        raise MarkdownError(here, f"exactly one answer of a quiz is the right one, marked [x]; this one has {len(right)}")
+    body = render("\n".join(lines[:begin]), dialect, block.body_line).strip("\n")
+    rendered = [_choice(*choice, dialect) for choice in choices]
+    return dialect.quiz(block, _inline(block.argument, dialect, block.line), body, rendered)
+
+
+def _choice(line: int, right: bool, text: str, dialect: Dialect) -> Choice:
+    masked = _INLINE.sub(lambda match: "x" * len(match[0]), text)  # a colon in code or maths separates nothing
+    at = masked.find(": ")
+    if at < 0:
+        raise MarkdownError(line, "every answer of a quiz explains itself: `- [ ] answer: explanation`")
+    return Choice(_inline(text[:at], dialect, line), _inline(text[at + 2 :].strip(), dialect, line), right)
 
 
 def _inline(text: str, dialect: Dialect, line: int) -> str:

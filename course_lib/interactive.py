@@ -70,7 +70,7 @@ def to_html(series, title: str, x_label: str, initial: dict, sliders: dict) -> s
     abscissae = [_rounded(range(len(one.y)) if one.x is None else one.x) for one in first.values()]
     data = {
         "xLabel": x_label,
-        "sliders": [{"name": name, "values": list(choices)} for name, choices in sliders.items()],
+        "sliders": [{"name": name, "values": [_label(choice) for choice in choices]} for name, choices in sliders.items()],
         "series": [{"name": name, "kind": one.kind, "x": x} for (name, one), x in zip(first.items(), abscissae, strict=True)],
         "panels": _panels(first, abscissae, values),
         "values": values,
@@ -116,17 +116,24 @@ def _panels(first: dict[str, Series], abscissae: list, values: list) -> list[dic
 def _controls(initial: dict, sliders: dict) -> str:
     return "".join(
         f'<label>{html.escape(name)} <input type="range" min="0" max="{len(choices) - 1}" step="1" '
-        f'value="{list(choices).index(initial[name])}" aria-valuetext="{html.escape(str(initial[name]))}"> '
-        f"<output>{html.escape(str(initial[name]))}</output></label>"
+        f'value="{list(choices).index(initial[name])}" aria-valuetext="{html.escape(_label(initial[name]))}"> '
+        f"<output>{html.escape(_label(initial[name]))}</output></label>"
         for name, choices in sliders.items()
     )
+
+
+def _label(choice: float | str) -> str:
+    """A slider's value as the page shows it."""
+    return choice if isinstance(choice, str) else f"{choice:g}"
 
 
 def _frames(data: dict) -> str:
     frames = []
     for panel in data["panels"]:
         names = [(i, html.escape(data["series"][i]["name"])) for i in panel["series"]]
-        key = "".join(f'<span class="key c{i % 5}" aria-hidden="true"></span>{name}' for i, name in names)
+        key = "".join(
+            f'<span class="entry"><span class="key c{i % 5}" aria-hidden="true"></span>{name}</span>' for i, name in names
+        )
         label = html.escape(panel["label"])
         frames.append(f'<p class="panel">{label}:{key}</p><div><svg role="img" aria-label="{label}"></svg></div>')
     return "".join(frames)

@@ -53,7 +53,7 @@
   const draw = () => {
     let combination = 0;
     sliders.forEach((slider, i) => {
-      const choices = data.sliders[i].values, chosen = String(choices[slider.value]);
+      const choices = data.sliders[i].values, chosen = choices[slider.value];
       combination = combination * choices.length + Number(slider.value);
       slider.setAttribute("aria-valuetext", chosen);
       slider.parentElement.querySelector("output").textContent = chosen;

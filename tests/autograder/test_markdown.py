@@ -48,6 +48,52 @@ def test_admonitions_and_margin_notes_become_quotations_with_formulas_on_one_lin
     assert _render(text) == expected
 
 
+QUIZ = """:::{quiz} Which `end`, $d_t$?
+Mind $T$.
+
+- [ ] `a: b` or $x: y$: It bootstraps,
+  see {eq}`one`.
+- [x] the other: Nothing follows: nothing.
+:::"""
+
+
+def test_a_quiz_in_a_notebook_is_a_list_and_a_fold():
+    assert _render(f"{QUIZ}\n\n$$ a $$ (one)").startswith(
+        "**Question.** Which `end`, $d_t$?\n\nMind $T$.\n\n- **A.** `a: b` or $x: y$\n- **B.** the other\n\n"
+        "<details>\n<summary>Answer</summary>\n\n- **A.** **Wrong.** It bootstraps, see (44.1).\n"
+        "- **B.** **Right.** Nothing follows: nothing.\n\n</details>\n"
+    )
+
+
+def test_a_quiz_in_the_book_is_a_list_and_a_fold_for_the_script_to_wire():
+    assert _render(f"{QUIZ}\n\n$$ a $$ (one)", markdown.Book).startswith(
+        ":::{div} quiz\n\nWhich `end`, $d_t$?\n\nMind $T$.\n\n1. `a: b` or $x: y$\n1. the other\n\n```{dropdown} Answer\n"
+        '1. <strong class="quiz-wrong">Wrong.</strong> It bootstraps, see [(44.1)](#eq-ch44-one).\n'
+        '1. <strong class="quiz-right">Right.</strong> Nothing follows: nothing.\n```\n:::\n'
+    )
+
+
+@pytest.mark.parametrize(
+    "text, line, message",
+    [
+        (":::{quiz} Q?\n- [ ] a: b\n- [ ] c: d\n:::", 1, "exactly one answer .* has 0"),
+        (":::{quiz} Q?\n- [x] a: b\n- [ ] c: d\n- [x] e: f\n:::", 4, "exactly one answer .* has 2"),
+        ("x\n\n:::{quiz} Q?\n- [x] a: b\n- [ ] c\n:::", 5, "explains itself"),
+        (":::{quiz} Q?\n- [ ] a: b\n- [x] `c: d`\n:::", 3, "explains itself"),
+        (":::{quiz}\n- [x] a: b\n- [ ] c: d\n:::", 1, "question on its first line"),
+        (":::{quiz} Q?\n- [x] a: b\n:::", 1, "at least two"),
+        (":::{quiz} Q?\nNo answers.\n:::", 1, "at least two"),
+        (":::{quiz} Q?\n- [x] a: b\n- [X] c: d\n:::", 3, "or \\[x\\] for the right one"),
+        (":::{quiz} Q?\n- [x] a: b\nwords\n- [ ] c: d\n:::", 3, "or \\[x\\] for the right one"),
+        (":::{quiz} Q?\n\n- [x] a: b\n- [ ] c: {ref}`d`\n:::", 4, "unknown role"),
+    ],
+)
+def test_a_quiz_that_is_not_one_is_refused_with_its_line(text, line, message):
+    with pytest.raises(markdown.MarkdownError, match=message) as caught:
+        _render(text)
+    assert caught.value.line == line
+
+
 def test_equations_are_numbered_by_chapter_and_referred_to_by_number():
     text = "$$ a = b $$ (one)\n\n:::{math}\n:label: two\n\nc\n:::\n\n{eq}`two` follows {eq}`one`."
     assert _render(text) == "$$\na = b\n\\tag{44.1}\n$$\n\n$$\nc\n\\tag{44.2}\n$$\n\n(44.2) follows (44.1)."

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
+from axe_playwright_python.sync_playwright import Axe
 
 from autograder.book import HOW_TO, docname
 from autograder.chapter import all_chapters
@@ -20,12 +22,18 @@ PAGES = ["index", *HOW_TO, "notation", "kill-matrix", *(docname(chapter) for cha
 CHAPTERS = [page for page in PAGES if page.startswith("chapters/")]
 
 
+def _id(chapter):
+    return chapter.assignment
+
+
 class Visit:
     """A page opened from disk, with what it asked for elsewhere and what it complained of."""
 
     def __init__(self, browser, path: Path, look: str = "light"):
         scheme, width = LOOKS[look]
-        self.context = browser.new_context(color_scheme=scheme, viewport={"width": width, "height": 900}, offline=True)
+        self.context = browser.new_context(
+            color_scheme=scheme, viewport={"width": width, "height": 900}, has_touch=look == "phone", offline=True
+        )
         self.page = self.context.new_page()
         self.requests: list[str] = []
         self.complaints: list[str] = []
@@ -69,21 +77,139 @@ def test_equations_are_rendered_and_begin_where_a_phone_can_show_them(browser, h
         assert visit.page.locator("span.math:not(:has(mjx-container)), div.math:not(:has(mjx-container))").count() == 0
 
 
+@pytest.mark.parametrize("chapter", all_chapters(), ids=_id)
+def test_sliders_moved_by_keyboard_show_the_librarys_own_values(browser, html, chapter):
+    with Visit(browser, html / f"{docname(chapter)}.html") as visit:
+        figures = visit.page.locator("figure.explorer").all()
+        assert figures
+        for figure, (series, choices) in zip(figures, _explorers(chapter), strict=True):
+            sliders = figure.get_by_role("slider").all()
+            for slider in sliders:
+                pictures = set()
+                slider.focus()
+                for key in ("Home", "ArrowRight", "End"):
+                    visit.page.keyboard.press(key)
+                    pictures.add(figure.evaluate("node => [...node.querySelectorAll('svg')].map(svg => svg.innerHTML).join()"))
+                    positions = [int(one.input_value()) for one in sliders]
+                    setting = {name: values[at] for (name, values), at in zip(choices.items(), positions, strict=True)}
+                    assert figure.locator("output").all_text_contents() == [
+                        value if isinstance(value, str) else f"{value:g}" for value in setting.values()
+                    ]
+                    assert _shown(figure) == _computed(series(**setting)), setting
+                assert len(pictures) > 1
+
+
+def _explorers(chapter):
+    """What the chapter gives to `explore`: functions of the sliders, and the sliders' choices; stubs are the references."""
+    given, namespace = [], {}
+    own = {"title", "x_label", "start"}
+
+    def explore(series, **options):
+        given.append((series, {name: values for name, values in options.items() if name not in own}))
+
+    code = [cell for cell in chapter.cells if cell.kind == "code"]
+    last = max(at for at, cell in enumerate(code) if "explore(" in cell.source)
+    with patch("course_lib.interactive.explore", explore), patch("matplotlib.pyplot.show"):
+        for cell in code[: last + 1]:
+            source = f"from solutions.{chapter.assignment} import {cell.exercise}" if cell.exercise else cell.source
+            exec(source, namespace)
+    return given
+
+
+def _shown(figure):
+    """The figure's table, series by series, read while it is folded."""
+    rows = figure.evaluate(
+        "node => [...node.querySelectorAll('tbody tr')].map(row => [...row.cells].map(cell => cell.textContent))"
+    )
+    return {name: [float(value or "nan") for value in values] for name, *values in rows}
+
+
+def _computed(series):
+    """What the table must hold: three significant digits are shown."""
+    return {name: pytest.approx(list(map(float, one.y)), rel=6e-3, abs=1e-6, nan_ok=True) for name, one in series.items()}
+
+
 @pytest.mark.parametrize("name", CHAPTERS)
-def test_sliders_change_what_is_shown(browser, html, name):
+def test_a_fold_opens_by_keyboard(browser, html, name):
     with Visit(browser, html / f"{name}.html") as visit:
-        sliders = visit.page.locator(".cell_output input[type=range]")
-        assert sliders.count() > 0
-        for slider in sliders.all():
-            shown = slider.locator("xpath=ancestor::div[contains(@class, 'cell_output')]")
-            slider.scroll_into_view_if_needed()
-            before = shown.evaluate("node => node.innerHTML")
-            slider.focus()
-            visit.page.keyboard.press("Home")
-            low = shown.evaluate("node => node.innerHTML")
-            visit.page.keyboard.press("End")
-            high = shown.evaluate("node => node.innerHTML")
-            assert low != high or before != low
+        fold = visit.page.locator("article details", has_text="Hint 1").first
+        body = fold.locator("p").last
+        assert not body.is_visible()
+        fold.locator("summary").focus()
+        visit.page.keyboard.press("Enter")
+        assert body.is_visible()
+
+
+@pytest.mark.parametrize("chapter", all_chapters(), ids=_id)
+def test_quizzes_explain_every_answer_by_keyboard(browser, html, chapter):
+    with Visit(browser, html / f"{docname(chapter)}.html") as visit:
+        quizzes = visit.page.locator("div.quiz").all()
+        assert len(quizzes) == chapter.path.read_text(encoding="utf-8").count(":::{quiz}") > 0
+        for quiz in quizzes:
+            form, verdict = quiz.get_by_role("group"), quiz.get_by_role("status")
+            assert form.evaluate("node => node.querySelector('legend').textContent.trim()")
+            assert verdict.text_content() == "" and quiz.locator("details").count() == 0
+            answers, heard = form.get_by_role("radio").all(), []
+            answers[0].focus()
+            for answer, key in zip(answers, ["Space", *["ArrowDown"] * len(answers)], strict=False):
+                visit.page.keyboard.press(key)
+                assert answer.is_checked() and verdict.is_visible()
+                heard.append(verdict.inner_text())
+            assert len(set(heard)) == len(answers)
+            assert sorted(text.split()[0] for text in heard) == ["Right."] + ["Wrong."] * (len(answers) - 1)
+
+
+@pytest.mark.parametrize("name", CHAPTERS)
+def test_quizzes_answer_to_a_tap_on_the_words(browser, html, name):
+    with Visit(browser, html / f"{name}.html", "phone") as visit:
+        quiz = visit.page.locator("div.quiz").first
+        quiz.locator("label > span").last.tap()
+        assert quiz.get_by_role("radio").last.is_checked()
+        assert quiz.get_by_role("status").is_visible()
+
+
+@pytest.mark.parametrize("name", CHAPTERS)
+def test_quizzes_without_scripts_are_lists_with_a_fold(browser, html, name):
+    context = browser.new_context(java_script_enabled=False, offline=True)
+    page = context.new_page()
+    page.goto((html / f"{name}.html").as_uri())
+    quiz = page.locator("div.quiz").first
+    explanations = quiz.locator("details li")
+    assert quiz.locator(":scope > ol > li").count() == explanations.count() > 1
+    assert not explanations.first.is_visible()
+    quiz.locator("summary").click()
+    assert explanations.first.is_visible()
+    context.close()
+
+
+@pytest.mark.parametrize("look", ["light", "dark"])
+@pytest.mark.parametrize("name", PAGES)
+def test_axe_finds_no_serious_or_critical_violation(browser, html, name, look):
+    with Visit(browser, html / f"{name}.html", look) as visit:
+        visit.page.evaluate("document.querySelectorAll('details').forEach(fold => { fold.open = true; })")
+        for answer in visit.page.locator("div.quiz label:last-of-type input").all():
+            answer.check()
+        found = Axe().run(visit.page).response["violations"]
+    grave = [violation for violation in found if violation["impact"] in ("serious", "critical")]
+    places = [f"{one['id']}: {node['target']} {node['failureSummary']}" for one in grave for node in one["nodes"]]
+    assert places == []
+
+
+@pytest.mark.parametrize("name", CHAPTERS)
+def test_the_printed_page_is_the_article_as_the_reader_left_it(browser, html, name):
+    with Visit(browser, html / f"{name}.html", "dark") as visit:
+        visit.page.emulate_media(media="print")
+        visit.page.pdf(path=SCREENSHOTS / f"{Path(name).name}.pdf", format="A4")
+        visit.page.set_viewport_size({"width": 720, "height": 1000})  # about what A4 leaves between its margins
+        visit.page.screenshot(path=SCREENSHOTS / f"{Path(name).name}-print.png", full_page=True)
+        assert visit.page.evaluate("document.documentElement.scrollWidth") <= 720
+        for gone in (".bd-sidebar-primary", ".bd-sidebar-secondary", ".bd-header-article", ".prev-next-footer"):
+            assert not visit.page.locator(gone).first.is_visible()
+        assert visit.page.evaluate("getComputedStyle(document.body).backgroundColor") in (
+            "rgb(255, 255, 255)",
+            "rgba(0, 0, 0, 0)",
+        )
+        assert visit.page.locator("article details[open]").count() == 0
 
 
 @pytest.mark.parametrize("name", CHAPTERS)
@@ -93,7 +219,7 @@ def test_notebook_can_be_downloaded_from_its_page(browser, html, name):
         assert (html / name).parent.joinpath(target).resolve().is_file()
 
 
-@pytest.mark.parametrize("chapter", all_chapters(), ids=lambda chapter: chapter.assignment)
+@pytest.mark.parametrize("chapter", all_chapters(), ids=_id)
 def test_every_reference_is_on_its_page_folded(browser, html, chapter):
     with Visit(browser, html / f"{docname(chapter)}.html") as visit:
         folded = visit.page.locator("details", has_text="Reference solution")
@@ -103,11 +229,12 @@ def test_every_reference_is_on_its_page_folded(browser, html, chapter):
         assert any(reference.body.strip() in text for text in shown)
 
 
-def test_search_works_from_disk(browser, html):
+@pytest.mark.parametrize("chapter", all_chapters(), ids=_id)
+def test_search_finds_a_word_of_the_chapter_from_disk(browser, html, chapter):
     with Visit(browser, html / "search.html") as visit:
-        visit.page.goto((html / "search.html").as_uri() + "?q=advantages")
+        visit.page.goto(f"{(html / 'search.html').as_uri()}?q={chapter.exercises[0].exercise}")
         visit.page.wait_for_selector("ul.search li")
-        assert "notation.html" in visit.page.locator("ul.search").inner_html()
+        assert f"{docname(chapter)}.html" in visit.page.locator("ul.search").inner_html()
         assert visit.complaints == []
 
 
