@@ -79,7 +79,7 @@ def replace_cached(path: Path, text: str) -> None:
     """Keep a result under `NAME-HASH.SUFFIX`, all of it or nothing, in place of those with another hash."""
     for stale in path.parent.glob(f"{path.name.rpartition('-')[0]}-*{path.suffix}"):
         stale.unlink()
-    unfinished = path.with_suffix(".unfinished")
+    unfinished = path.with_suffix(f".{os.getpid()}-unfinished")
     unfinished.write_text(text, encoding="utf-8")
     unfinished.replace(path)
 
