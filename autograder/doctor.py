@@ -96,11 +96,12 @@ def _sandbox() -> Check:
 
 
 def _nbgrader() -> Check:
-    # nbgrader calls the program alembic to bring an old gradebook's tables up to date.
-    if shutil.which("alembic"):
-        return Check("nbgrader", _installed("nbgrader") != "missing", f"{_installed('nbgrader')}, alembic on PATH")
+    installed = _installed("nbgrader")
+    if installed == "missing" or shutil.which("alembic"):
+        return Check("nbgrader", installed != "missing", f"{installed}, alembic on PATH")
+    # nbgrader's own commands call that program to bring an old gradebook's tables up to date; `course grade` does not
     remedy = f"Put this environment's programs first: export PATH={Path(sys.executable).parent}:$PATH"
-    return Check("nbgrader", False, "the program alembic is not on PATH", remedy)
+    return Check("nbgrader", False, "the program alembic is not on PATH: nbgrader's own commands need it", remedy, required=False)
 
 
 def _frozen() -> Check:
