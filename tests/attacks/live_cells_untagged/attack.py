@@ -1,5 +1,5 @@
-"""Takes the `live` tag off the training cells and adds one of its own that loops, tagged so: what the release marks live never
-runs."""
+"""Takes the `live` tag off the released training cells, and puts it on a cell of its own that loops. The released ones are known by
+their ids and do not run; the tag protects no added cell, which is dropped when its time is up, and everything else counts."""
 
 from pathlib import Path
 
