@@ -37,7 +37,17 @@ BLOCK = re.compile(
     re.M | re.S,
 )
 GENERATED = ("_build", "_stage", "_cache", "frozen", "__pycache__")
-SOURCES = ("autograder", "book", "chapters", "course_lib", "solutions", "tests", "pyproject.toml", "requirements.txt")
+SOURCES = (
+    "autograder",
+    "book",
+    "chapters",
+    "course_lib",
+    "solutions",
+    "tests",
+    "pyproject.toml",
+    "requirements.txt",
+    "constraints.txt",
+)
 
 
 class Page:
