@@ -153,7 +153,7 @@ def kill_matrix_page(matrix: dict[str, list[dict]]) -> str:
 
 
 def kill_rows(chapter: Chapter) -> list[dict]:
-    """autograder.killmatrix.rows of the chapter as dicts, computed on all cores once for each state of what takes part."""
+    """The chapter's kill matrix, a dict for each exercise, computed on all cores once for each state of what takes part."""
     library = [COURSE_LIB / f"{module}.py" for module in JUDGING]
     own = [path for path in code_inputs(chapter.assignment) if COURSE_LIB not in path.parents]
     cached = (

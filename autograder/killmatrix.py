@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from autograder import checks, freeze
+from autograder import freeze
 from autograder.spec import Exercise
 from course_lib.cases import FrozenExercise
 from course_lib.diagnosis import Finding, diagnose
@@ -41,11 +41,6 @@ class ExerciseRows:
     seeds: int
     misconceptions: list[MisconceptionRow] = field(default_factory=list)
     variants: list[VariantRow] = field(default_factory=list)
-
-
-def rows(assignment: str, seeds: int = SEEDS) -> list[ExerciseRows]:
-    """The kill matrix of assignment "chNN", an entry per exercise."""
-    return [exercise_rows(exercise, seeds) for exercise in checks.exercises(assignment)]
 
 
 def exercise_rows(exercise: Exercise, seeds: int = SEEDS) -> ExerciseRows:
