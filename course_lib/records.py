@@ -154,7 +154,7 @@ class Records:
         """The configuration of a variant, as its runs were made."""
         return self.of(variant)[0].provenance["configuration"]
 
-    def curve(self, variant: str, column: str, x: str = "step", points: int = 200) -> tuple[np.ndarray, np.ndarray]:
+    def curve(self, variant: str, column: str, x: str = "env_steps", points: int = 200) -> tuple[np.ndarray, np.ndarray]:
         """What a variant logged, over its seeds: x (points,) and scores (seeds, points).
 
         See `curves`, of which this is the case of one variant.
@@ -163,7 +163,7 @@ class Records:
         return grid, scores[variant]
 
     def curves(
-        self, column: str, labels: Mapping[str, str], x: str = "step", points: int = 200
+        self, column: str, labels: Mapping[str, str], x: str = "env_steps", points: int = 200
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """What several variants logged, at common positions: for `plotting.curves`.
 

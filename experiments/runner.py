@@ -60,7 +60,7 @@ class Result:
     """What a run returns: rows as logged, final results, and files beside the record, suffix -> content.
 
     Args:
-      rows: one dictionary for each logging step, with the same "step" (or another x) in all.
+      rows: one dictionary for each logging step, with "env_steps" (or another abscissa) in all.
       summary: name -> a number or a list of numbers, for what is known at the end only, such as 100 returns.
       artefacts: such as {"safetensors": policy}, written to VARIANT-SEED.safetensors.
     """

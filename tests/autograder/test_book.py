@@ -66,7 +66,7 @@ def test_code_runs_again_after_a_change_of(name, tiny, elsewhere):
     assert execution.execution_key(tiny.chapter) != key
 
 
-def test_a_new_record_of_a_chapters_experiment_runs_it_again(tiny, tmp_path, monkeypatch):
+def test_a_new_record_of_a_chapters_experiment_runs_it_again(tiny, elsewhere, tmp_path, monkeypatch):
     monkeypatch.setattr(execution, "RUNS", tmp_path)
     page = dataclasses.replace(tiny.chapter, experiments=("toy",))
     key = execution.execution_key(page)

@@ -84,7 +84,7 @@ def test_records_of_long_runs_are_put_beside_the_library_but_no_policies(tiny, t
     with pytest.raises(ValueError, match=r"no records of the experiment 'toy' .*`course experiment toy` makes them"):
         _release(tiny, tmp_path / "bundle")
     made = {"variant": "a", "seed": 0, "configuration": {}, "summary": {}}
-    records.write(tmp_path / "runs" / "toy" / "a-0.parquet", [{"step": 0, "score": 4.0}], made)
+    records.write(tmp_path / "runs" / "toy" / "a-0.parquet", [{"env_steps": 0, "score": 4.0}], made)
     for name in ("a-0.safetensors", "a-0.mp4", ".writing-x.mp4"):
         (tmp_path / "runs" / "toy" / name).write_bytes(b"content")
     bundle = _release(tiny, tmp_path / "bundle")

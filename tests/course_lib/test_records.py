@@ -25,20 +25,24 @@ def put(folder, variant, seed, rows, **others):
 
 
 def line(slope, steps):
-    return [{"step": step, "score": float(slope * step)} for step in steps]
+    return [{"env_steps": step, "score": float(slope * step)} for step in steps]
 
 
 def test_what_is_written_is_read(tmp_path):
-    rows = [{"step": 1, "score": 0.1, "kind": "x"}, {"step": 2, "score": None, "kind": "y"}, {"step": 3, "kind": "z"}]
+    rows = [
+        {"env_steps": 1, "score": 0.1, "kind": "x"},
+        {"env_steps": 2, "score": None, "kind": "y"},
+        {"env_steps": 3, "kind": "z"},
+    ]
     run = records.read(put(tmp_path, "a", 4, rows, summary={"returns": [1.0, 2.5]}))
     assert (run.variant, run.seed, run.provenance["summary"]) == ("a", 4, {"returns": [1.0, 2.5]})
-    assert run.columns["step"].tolist() == [1, 2, 3] and run.columns["step"].dtype.kind == "i"
+    assert run.columns["env_steps"].tolist() == [1, 2, 3] and run.columns["env_steps"].dtype.kind == "i"
     np.testing.assert_array_equal(run.columns["score"], [0.1, math.nan, math.nan])
     assert run.columns["kind"].tolist() == ["x", "y", "z"]
 
 
 def test_a_record_is_small(tmp_path):
-    rows = [{"step": 2048 * i, **{f"metric{j}": math.sin(i * j) for j in range(8)}} for i in range(200)]
+    rows = [{"env_steps": 2048 * i, **{f"metric{j}": math.sin(i * j) for j in range(8)}} for i in range(200)]
     assert put(tmp_path, "a", 0, rows).stat().st_size < 20_000
 
 
@@ -60,7 +64,7 @@ def test_runs_that_logged_at_the_same_steps_come_as_logged(tmp_path):
 def test_runs_that_logged_elsewhere_are_interpolated_on_what_they_share(tmp_path):
     put(tmp_path, "a", 0, line(1, [0, 10, 20, 30]))
     put(tmp_path, "a", 1, line(2, [5, 15, 25]))
-    put(tmp_path, "b", 0, [{"step": 5}, *line(3, [10, 35])])  # no score in the first row
+    put(tmp_path, "b", 0, [{"env_steps": 5}, *line(3, [10, 35])])  # no score in the first row
     x, curves = records.load("toy", tmp_path).curves("score", {"a": "first", "b": "second"})
     assert x.tolist() == [10, 15, 20, 25] and list(curves) == ["first", "second"]
     np.testing.assert_allclose(curves["first"], [x, 2 * x])
@@ -100,7 +104,7 @@ def test_missing_records_name_the_command_that_makes_them(tmp_path):
     loaded = records.load("toy", tmp_path)
     with pytest.raises(RecordsError, match=r"variant 'b', only of a. `course experiment toy --variant b`"):
         loaded.curve("b", "score")
-    with pytest.raises(RecordsError, match="no column 'kl', only step, score"):
+    with pytest.raises(RecordsError, match="no column 'kl', only env_steps, score"):
         loaded.curve("a", "kl")
     with pytest.raises(RecordsError, match=r"a-0.safetensors is missing. `course experiment toy --variant a`"):
         loaded.artefact("a", 0, "safetensors")
@@ -128,7 +132,7 @@ def test_a_foreign_parquet_file_and_a_renamed_record_are_refused(tmp_path):
     path.rename(path.with_name("b-0.parquet"))
     with pytest.raises(RecordsError, match="holds the run a-0: a file was renamed"):
         records.load("toy", tmp_path)
-    pyarrow.parquet.write_table(pyarrow.table({"step": [1]}), path.with_name("b-0.parquet"))
+    pyarrow.parquet.write_table(pyarrow.table({"env_steps": [1]}), path.with_name("b-0.parquet"))
     with pytest.raises(RecordsError, match="damaged"):
         records.load("toy", tmp_path)
 

@@ -25,7 +25,7 @@ def run(variant, seed, checkpoint_dir, report):
         time.sleep(configuration.get("pause", 0))
         with (checkpoint_dir.parents[3] / "steps.txt").open("a") as log:
             log.write(f"{variant}-{seed}-{step}\\n")
-        rows.append({"step": step, "score": float(seed + step)})
+        rows.append({"env_steps": step, "score": float(seed + step)})
         checkpoint.save(checkpoint_dir, {"rows": rows})
         report(step + 1, configuration["steps"])
     return Result(rows, {"last": rows[-1]["score"]}, {"txt": b"artefact"})

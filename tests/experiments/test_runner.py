@@ -52,7 +52,7 @@ def test_a_changed_configuration_and_a_damaged_file_are_made_again(folder):
     (folder / "toy.py").write_text((folder / "toy.py").read_text().replace('"steps": 3', '"steps": 2'))
     assert [runner.state(task) for task in todo(folder, "fast")] == ["damaged", "outdated"]
     assert ends(runner.make(todo(folder, "fast"))) == [("fast", 0, "made"), ("fast", 1, "made")]
-    assert [len(records.read(path).columns["step"]) for path in records_of] == [2, 2]
+    assert [len(records.read(path).columns["env_steps"]) for path in records_of] == [2, 2]
 
 
 def test_a_run_that_fails_tells_why_and_costs_the_others_nothing(folder):
@@ -93,7 +93,7 @@ def test_after_kill_nine_the_next_command_goes_on_where_the_run_was(folder):
     before = len(steps(folder))
     assert 5 <= before < 40
     assert ends(runner.make([task])) == [("slow", 0, "made")]
-    assert len(records.read(task.record).columns["step"]) == 40
+    assert len(records.read(task.record).columns["env_steps"]) == 40
     assert len(steps(folder)) <= 41, "one step at most was taken twice"
 
 
