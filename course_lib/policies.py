@@ -21,7 +21,7 @@ import safetensors.torch
 import torch
 
 LAYERS = ("0", "1", "out")
-LANDER = dict(obs_dim=8, action_dim=2, discrete=False, hidden=64)
+LANDER = {"obs_dim": 8, "action_dim": 2, "discrete": False, "hidden": 64}
 """The architecture of a policy for LunarLanderContinuous that the course can fly: `make_policy(**LANDER)`."""
 
 

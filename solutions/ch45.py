@@ -101,7 +101,7 @@ def collect_rollout(envs, policy, num_steps, obs, generator):
         steps.append((before, actions, rewards, true_next_obs(obs, info), terminated, truncated))
     columns = [torch.as_tensor(np.stack(column)) for column in zip(*steps, strict=True)]
     columns = [column.float() if column.is_floating_point() else column for column in columns]
-    return Rollout(*columns, last_obs=torch.as_tensor(obs, dtype=torch.float32))
+    return Rollout(*columns, torch.as_tensor(obs, dtype=torch.float32))
 
 
 def minibatches(batch_size, minibatch_size, generator):
