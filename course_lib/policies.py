@@ -66,31 +66,33 @@ class ActorCritic:
 
     def __post_init__(self):
         self.shapes = tensor_shapes(self.obs_dim, self.action_dim, self.discrete, self.hidden)
-        self._arrays = self.unflatten(self.weights.detach().numpy())  # views: they follow the vector
+        self.arrays = self.unflatten(self.weights.detach().numpy())  # views: they follow the vector
+        self.gradient = np.zeros_like(self.weights.detach().numpy())
+        self.gradients = self.unflatten(self.gradient)
 
     def __call__(self, obs) -> tuple[Gaussian | Categorical, torch.Tensor]:
         """The distribution of actions in each state, and the values (...,); both pass gradient to `weights`."""
-        inputs = self._inputs(obs)
+        inputs = self.normalize(obs)
         outputs, log_std, values = _Networks.apply(self.weights, self, inputs.reshape(-1, self.obs_dim))
         outputs, values = outputs.view(*inputs.shape[:-1], -1), values.view(inputs.shape[:-1])
         return (Categorical(outputs) if self.discrete else Gaussian(outputs, log_std)), values
 
     def value(self, obs) -> torch.Tensor:
         """V(obs), (...,), without a graph."""
-        return torch.from_numpy(self._run("critic", self._inputs(obs))[-1][..., 0])
+        return torch.from_numpy(self.forward("critic", self.normalize(obs))[-1][..., 0])
 
     def act(self, obs, generator) -> torch.Tensor:
         """Sample actions, (..., A) or (...,) int64, without a graph; `generator` is all that is drawn from."""
-        outputs = torch.from_numpy(self._run("actor", self._inputs(obs))[-1])
+        outputs = torch.from_numpy(self.forward("actor", self.normalize(obs))[-1])
         if self.discrete:  # the Gumbel trick: argmax of logits + noise is a draw from softmax(logits)
             noise = torch.empty_like(outputs).exponential_(generator=generator).log()
             return (outputs - noise).argmax(-1)
         noise = torch.randn(outputs.shape, generator=generator, dtype=outputs.dtype)
-        return outputs.addcmul_(noise, torch.from_numpy(np.exp(self._arrays["log_std"])))
+        return outputs.addcmul_(noise, torch.from_numpy(np.exp(self.arrays["log_std"])))
 
     def best_action(self, obs) -> torch.Tensor:
         """The likeliest action, (..., A) or (...,) int64, without a graph."""
-        outputs = torch.from_numpy(self._run("actor", self._inputs(obs))[-1])
+        outputs = torch.from_numpy(self.forward("actor", self.normalize(obs))[-1])
         return outputs.argmax(-1) if self.discrete else outputs
 
     def observe(self, obs) -> None:
@@ -108,7 +110,7 @@ class ActorCritic:
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """The parameters by name: views on `weights`."""
-        return {name: torch.from_numpy(array) for name, array in self._arrays.items()}
+        return {name: torch.from_numpy(array) for name, array in self.arrays.items()}
 
     def unflatten(self, vector: np.ndarray) -> dict[str, np.ndarray]:
         """Views on a flat vector by the names of the parameters."""
@@ -118,18 +120,29 @@ class ActorCritic:
             for (name, shape), part in zip(self.shapes.items(), np.split(vector, ends[:-1]), strict=True)
         }
 
-    def _inputs(self, obs) -> np.ndarray:
+    def normalize(self, obs) -> np.ndarray:
+        """(obs - obs_mean) / obs_std, an array of the type of the weights."""
         obs = obs.numpy() if isinstance(obs, torch.Tensor) else np.asarray(obs)
-        return ((obs - self.obs_mean.numpy()) / self.obs_std.numpy()).astype(self._arrays["actor.0.bias"].dtype, copy=False)
+        return ((obs - self.obs_mean.numpy()) / self.obs_std.numpy()).astype(self.arrays["actor.0.bias"].dtype, copy=False)
 
-    def _run(self, network, inputs) -> list[np.ndarray]:
-        """The inputs of the three layers and the network's output."""
+    def forward(self, network, inputs) -> list[np.ndarray]:
+        """What enters each of the three layers of "actor" or "critic", and at last what comes out: arrays (B, ...)."""
         activations = [inputs]
         for layer in LAYERS:
-            sums = activations[-1] @ self._arrays[f"{network}.{layer}.weight"]
-            sums += self._arrays[f"{network}.{layer}.bias"]
+            sums = activations[-1] @ self.arrays[f"{network}.{layer}.weight"]
+            sums += self.arrays[f"{network}.{layer}.bias"]
             activations.append(sums if layer == "out" else np.tanh(sums, out=sums))
         return activations
+
+    def backward(self, network, activations, gradient) -> None:
+        """Write the gradient of a network's weights into `self.gradient`, from `forward`'s answer and its output's gradient."""
+        for layer, inputs in zip(reversed(LAYERS), reversed(activations[:-1]), strict=True):
+            np.matmul(inputs.T, gradient, out=self.gradients[f"{network}.{layer}.weight"])
+            np.add.reduce(gradient, 0, out=self.gradients[f"{network}.{layer}.bias"])
+            if layer != "0":  # through the tanh that made these inputs: its derivative is 1 - tanh²
+                gradient = gradient @ self.arrays[f"{network}.{layer}.weight"].T
+                slope = inputs * inputs
+                gradient *= np.subtract(1, slope, out=slope)
 
 
 class _Networks(torch.autograd.Function):
@@ -137,27 +150,18 @@ class _Networks(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, weights, policy, inputs):
-        ctx.policy, ctx.actor, ctx.critic = policy, policy._run("actor", inputs), policy._run("critic", inputs)
-        log_std = policy._arrays.get("log_std", np.empty(0, inputs.dtype)).copy()
+        ctx.policy, ctx.actor, ctx.critic = policy, policy.forward("actor", inputs), policy.forward("critic", inputs)
+        log_std = policy.arrays.get("log_std", np.empty(0, inputs.dtype)).copy()
         return tuple(map(torch.from_numpy, (ctx.actor[-1], log_std, ctx.critic[-1][:, 0])))
 
     @staticmethod
     def backward(ctx, outputs_gradient, log_std_gradient, values_gradient):
         policy = ctx.policy
-        flat = np.empty(policy.weights.numel(), ctx.actor[0].dtype)
-        gradients = policy.unflatten(flat)
-        for network, activations, gradient in (
-            ("actor", ctx.actor, outputs_gradient.numpy()),
-            ("critic", ctx.critic, values_gradient.numpy()[:, None]),
-        ):
-            for layer, inputs in zip(reversed(LAYERS), reversed(activations[:-1]), strict=True):
-                np.matmul(inputs.T, gradient, out=gradients[f"{network}.{layer}.weight"])
-                gradient.sum(0, out=gradients[f"{network}.{layer}.bias"])
-                if layer != "0":  # through the tanh that made these inputs: its derivative is 1 - tanh²
-                    gradient = (gradient @ policy._arrays[f"{network}.{layer}.weight"].T) * (1 - inputs * inputs)
+        policy.backward("actor", ctx.actor, outputs_gradient.numpy())
+        policy.backward("critic", ctx.critic, values_gradient.numpy()[:, None])
         if not policy.discrete:
-            gradients["log_std"][:] = log_std_gradient.numpy()
-        return torch.from_numpy(flat), None, None
+            policy.gradients["log_std"][:] = log_std_gradient.numpy()
+        return torch.from_numpy(policy.gradient.copy()), None, None
 
 
 def make_policy(obs_dim, action_dim, discrete=False, hidden=64, log_std=0.0, seed=0) -> ActorCritic:

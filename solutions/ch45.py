@@ -233,7 +233,7 @@ def estimate(policy, rollout, settings, reward=None):
     return batch, explained
 
 
-def train_ppo(envs, settings, seed=0, policy=None, reward=None, log=None):
+def train_ppo(envs, settings, seed=0, policy=None, reward=None, log=None, update=None):
     """Train a policy by PPO: collect, estimate, update, log.
 
     Schulman et al. (2017), algorithm 1, https://arxiv.org/abs/1707.06347
@@ -249,6 +249,7 @@ def train_ppo(envs, settings, seed=0, policy=None, reward=None, log=None):
       log: called after each update with a row, a dict of floats: env_steps, episodes (that
         ended in this rollout), mean_return (of those; NaN if none), explained_variance,
         learning_rate, seconds (since the start), and the metrics of ppo_update.
+      update: what is called in place of ppo_update, with the same arguments.
 
     Returns: the trained policy.
     """
@@ -263,7 +264,7 @@ def train_ppo(envs, settings, seed=0, policy=None, reward=None, log=None):
 
         rollout = collect_rollout(envs, policy, settings.num_steps, obs, generator)
         batch, explained = estimate(policy, rollout, settings, reward)
-        metrics = ppo_update(policy, optimizer, batch, settings, generator)
+        metrics = (update or ppo_update)(policy, optimizer, batch, settings, generator)
         if settings.normalize_obs:
             policy.observe(batch.obs)
 
@@ -282,3 +283,80 @@ def train_ppo(envs, settings, seed=0, policy=None, reward=None, log=None):
                 | {name: metric.item() for name, metric in metrics.items()}
             )
     return policy
+
+
+def fast_ppo_update(policy, optimizer, batch, settings, generator):
+    """What ppo_update does, up to rounding, in a fifth of its time.
+
+    With 64 samples in a minibatch, PyTorch's bookkeeping takes far longer than the
+    arithmetic. So the loss is differentiated on paper, and NumPy does the sums:
+
+        ∂L/∂log π = -ρ A / B where the clip does not bind, else 0
+        ∂L/∂V = 2 c_v (V - R) / B,   ∂L/∂H = -c_e
+
+    The rest is the chain rule through log π and H, in `gaussian_head` and
+    `categorical_head`, and through the networks, in `policy.backward`.
+
+    Args, returns: as ppo_update.
+    """
+    columns = [column.numpy() for column in (batch.obs, batch.actions, batch.old_log_probs, batch.advantages, batch.returns)]
+    columns[0] = policy.normalize(columns[0])
+    head = categorical_head if policy.discrete else gaussian_head
+    low, high = 1 - settings.clip_range, 1 + settings.clip_range
+    history = []
+    policy.weights.grad = torch.from_numpy(policy.gradient)  # one memory: what `backward` writes is what `step` reads
+    for _ in range(settings.num_epochs):
+        epoch = []
+        for indices in minibatches(len(batch), settings.minibatch_size, generator):
+            obs, actions, old_log_probs, advantages, returns = (column[indices.numpy()] for column in columns)
+            actor, critic = policy.forward("actor", obs), policy.forward("critic", obs)
+            log_probs, entropy, pull_back = head(policy, actor[-1], actions)
+            log_ratio, errors = log_probs - old_log_probs, critic[-1][:, 0] - returns
+            ratio = np.exp(log_ratio)
+            gains, clipped_gains = ratio * advantages, np.minimum(np.maximum(ratio, low), high) * advantages
+            outputs_gradient = pull_back(np.where(gains <= clipped_gains, gains, 0) / -len(gains), -settings.ent_coef)
+            policy.backward("actor", actor, outputs_gradient)
+            policy.backward("critic", critic, (2 * settings.vf_coef / len(errors)) * errors[:, None])
+            optimizer.step(policy, settings.max_grad_norm)
+            outside = np.count_nonzero(np.abs(ratio - 1) > settings.clip_range)
+            sums = -np.minimum(gains, clipped_gains).sum(), errors @ errors, (ratio - 1 - log_ratio).sum(), outside
+            epoch.append((sums[0], sums[1], entropy * len(gains), sums[2], sums[3]) / np.float32(len(gains)))
+        history += epoch
+        if np.mean([metrics[3] for metrics in epoch]) > settings.target_kl:
+            break
+    names = "policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction"
+    return dict(zip(names, torch.as_tensor(np.mean(history, axis=0)), strict=True))
+
+
+def gaussian_head(policy, mean, actions):
+    """Log-probabilities (B,), mean entropy, and the chain rule through both.
+
+    Returns: (log_probs, entropy, pull_back), where pull_back(d_log_probs (B,), d_entropy)
+      gives the gradient of the mean, (B, A), and leaves that of log_std in the policy.
+    """
+    log_std = policy.arrays["log_std"]
+    inverse = np.exp(-log_std)
+    scaled = (actions - mean) * inverse
+    squares = scaled * scaled
+    constant = log_std.sum() + 0.5 * math.log(2 * math.pi) * len(log_std)
+
+    def pull_back(d_log_probs, d_entropy):
+        policy.gradients["log_std"][:] = d_log_probs @ (squares - 1) + d_entropy
+        return d_log_probs[:, None] * scaled * inverse
+
+    return -0.5 * squares.sum(1) - constant, constant + 0.5 * len(log_std), pull_back
+
+
+def categorical_head(policy, logits, actions):
+    """The same for discrete actions: pull_back gives the gradient of the logits."""
+    shifted = logits - logits.max(1, keepdims=True)
+    log_all = shifted - np.log(np.exp(shifted).sum(1, keepdims=True))
+    probs, rows = np.exp(log_all), np.arange(len(logits))
+    entropies = -(probs * log_all).sum(1)
+
+    def pull_back(d_log_probs, d_entropy):
+        gradient = -(d_log_probs[:, None] + (d_entropy / len(rows)) * (log_all + entropies[:, None])) * probs
+        gradient[rows, actions] += d_log_probs
+        return gradient
+
+    return log_all[rows, actions], entropies.mean(), pull_back
