@@ -308,7 +308,8 @@ def fast_ppo_update(policy, optimizer, batch, settings, generator):
     for _ in range(settings.num_epochs):
         epoch = []
         for indices in minibatches(len(batch), settings.minibatch_size, generator):
-            obs, actions, old_log_probs, advantages, returns = (column[indices.numpy()] for column in columns)
+            rows = indices.numpy()
+            obs, actions, old_log_probs, advantages, returns = (column[rows] for column in columns)
             actor, critic = policy.forward("actor", obs), policy.forward("critic", obs)
             log_probs, entropy, pull_back = head(policy, actor[-1], actions)
             log_ratio, errors = log_probs - old_log_probs, critic[-1][:, 0] - returns
