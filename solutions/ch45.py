@@ -326,7 +326,7 @@ def fast_ppo_update(policy, optimizer, batch, settings, generator):
         if np.mean([metrics[3] for metrics in epoch]) > settings.target_kl:
             break
     names = "policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction"
-    return dict(zip(names, torch.as_tensor(np.mean(history, axis=0)), strict=True))
+    return dict(zip(names, torch.from_numpy(np.mean(history, axis=0, dtype=np.float32)), strict=True))
 
 
 def gaussian_head(policy, mean, actions):
