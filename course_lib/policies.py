@@ -8,7 +8,6 @@ what `policy(obs)` returns, call `backward()`, and the gradient is in `policy.we
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -248,7 +247,7 @@ def save_policy(policy, path) -> None:
     """Write a policy as a safetensors file: its parameters by name, `obs_mean` and `obs_std`."""
     tensors = {name: tensor.clone() for name, tensor in policy.tensors().items()}
     tensors |= {"obs_mean": policy.obs_mean, "obs_std": policy.obs_std}
-    safetensors.torch.save_file(tensors, Path(path), metadata={"discrete": json.dumps(policy.discrete)})
+    safetensors.torch.save_file(tensors, Path(path))
 
 
 def load_policy(path) -> ActorCritic:
