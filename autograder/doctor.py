@@ -105,7 +105,7 @@ def _nbgrader() -> Check:
 
 
 def _frozen() -> Check:
-    count = len(list((ROOT / "course_lib" / "frozen").glob("*.npz")))
+    count = len(list((ROOT / "course_lib" / "frozen").glob("*.*")))
     remedy = (
         "" if count else "Nothing to do: `course check` and the first build of the book freeze them, and a bundle has its own."
     )

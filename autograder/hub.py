@@ -9,20 +9,26 @@ import contextlib
 import functools
 import io
 from collections.abc import Callable
+from pathlib import Path
 
-from autograder import checks, freeze, killmatrix
+from autograder import artefacts, checks, freeze, killmatrix
+from autograder.spec import Artefact
+from course_lib.artefact import FrozenArtefact, judge_here
 from course_lib.cases import FrozenExercise
 
 
 def score(name: str, function: Callable) -> float:
-    """The points that `function` earns as the exercise `name`, all cases included.
+    """The points that `function` earns as the exercise `name`, all cases included; or the file beside the notebook, if that is judged.
 
     nbgrader takes a cell's number as partial credit. Nothing is printed: anything on stderr would cost the learner all points.
     """
     with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
-        return killmatrix.run(function, _frozen(name)).score
+        frozen = _frozen(name)
+        finding = judge_here(frozen, Path()) if isinstance(frozen, FrozenArtefact) else killmatrix.run(function, frozen)
+        return finding.score
 
 
 @functools.cache
-def _frozen(name: str) -> FrozenExercise:
-    return next(freeze.complete(exercise) for exercise in checks.all_exercises() if exercise.name == name)
+def _frozen(name: str) -> FrozenExercise | FrozenArtefact:
+    exercise = next(exercise for exercise in checks.all_exercises() if exercise.name == name)
+    return artefacts.hidden(exercise) if isinstance(exercise, Artefact) else freeze.complete(exercise)
