@@ -26,7 +26,7 @@ from course_lib.diagnosis import Finding
 
 RECEIPT = "handed_in: "  # begins the flag that says which file was flown: `handed_in: NAME sha256 HEX`
 PROGRAM = Path(course_lib.flight.__file__)
-THREADS = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 class FlightFailed(RuntimeError):

@@ -11,10 +11,11 @@ import io
 from collections.abc import Callable
 from pathlib import Path
 
-from autograder import artefacts, checks, freeze, killmatrix
+from autograder import artefacts, checks, freeze
 from autograder.spec import Artefact
 from course_lib.artefact import FrozenArtefact, judge_here
 from course_lib.cases import FrozenExercise
+from course_lib.diagnosis import examine
 
 
 def score(name: str, function: Callable) -> float:
@@ -24,8 +25,7 @@ def score(name: str, function: Callable) -> float:
     """
     with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
         frozen = _frozen(name)
-        finding = judge_here(frozen, Path()) if isinstance(frozen, FrozenArtefact) else killmatrix.run(function, frozen)
-        return finding.score
+        return (judge_here(frozen, Path()) if isinstance(frozen, FrozenArtefact) else examine(frozen, function)).score
 
 
 @functools.cache

@@ -150,8 +150,8 @@ def read_regular(path: Path, limit: int) -> bytes:
         if not stat.S_ISREG(status.st_mode):
             raise BadFile("is not a regular file")
         if status.st_size > limit:
-            size, remedy = (f"{limit >> 20} MB", ": clear its outputs and save it again") if limit >= 1 << 20 else (f"{limit >> 10} kB", "")
-            raise BadFile(f"is larger than {size}{remedy}")
+            allowed = f"{limit >> 20} MB: clear its outputs and save it again" if limit == MAX_NOTEBOOK else f"{limit >> 10} kB"
+            raise BadFile(f"is larger than {allowed}")
         return file.read(limit + 1)
 
 

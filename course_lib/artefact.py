@@ -70,7 +70,7 @@ def missing(artefact: FrozenArtefact) -> Finding:
     """The finding where there is no file."""
     message = (
         f"There is no file {artefact.file} beside the notebook. When your policy is trained, write it with"
-        f' safetensors.torch.save_file(policy.state_dict(), "{artefact.file}"), and hand it in with the notebook.'
+        f' course_lib.policies.save_policy(policy, "{artefact.file}"), and hand it in with the notebook.'
     )
     return Finding(artefact.name, "not_implemented", 0.0, artefact.points, message=message)
 

@@ -15,8 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from course_lib.cases import FACET_TEXT, FrozenExercise, load
-from course_lib.diagnosis import Finding, diagnose
-from course_lib.runner import observe
+from course_lib.diagnosis import Finding, examine
 
 FROZEN = Path(__file__).parent / "frozen"
 
@@ -94,7 +93,7 @@ def check(function: Callable) -> CheckResult:
 def _check_function(name: str, function: Callable) -> CheckResult:
     exercise = visible_cases(name)
     start = time.perf_counter()
-    finding = diagnose(exercise, [observe(function, case.arguments, case.differentiate) for case in exercise.cases])
+    finding = examine(exercise, function)
     took = 1000 * (time.perf_counter() - start)
     praise = f"{len(exercise.cases)} visible cases, {took:.0f} ms. The grader draws more like them."
     return CheckResult(finding, praise, [facet for facet in FACET_TEXT if exercise.criteria.get(facet)])
@@ -111,7 +110,9 @@ def check_file(name: str) -> CheckResult:
 
     finding = artefact.judge_here(artefact.load(FROZEN / f"{name}.json"), Path())
     if finding.state in ("correct", "partial", "wrong"):
-        finding.message += f"\nThat would be {finding.score:g} of {finding.max_score:g} points. The grader flies other episodes, and more."
+        finding.message += (
+            f"\nThat would be {finding.score:g} of {finding.max_score:g} points. The grader flies other episodes, and more."
+        )
     return CheckResult(finding, finding.message)
 
 

@@ -22,31 +22,26 @@ MAX_BYTES = 256 << 10  # of a file; one of ours has an eighth of it
 
 @dataclass(frozen=True)
 class Task:
-    """What is flown, and the policy's architecture, which the course fixes: a network of tanh layers whose last one is linear.
-
-    `tensors` gives name and shape of everything that the file must hold. `layers` names the layers of the policy's mean in order, each
-    of them the tensors NAME.weight (out, in) and NAME.bias (out,). Actions are the mean, clipped to [-1, 1]: no noise.
-    """
+    """What is flown, and the policy's architecture, which the course fixes: course_lib.policies.make_policy with these arguments."""
 
     environment: str
-    tensors: Mapping[str, tuple[int, ...]]
-    layers: Sequence[str]
+    obs_dim: int
+    action_dim: int
+    hidden: int
+
+    @property
+    def tensors(self) -> dict[str, tuple[int, ...]]:
+        """Name and shape of everything that the file must hold, as course_lib.policies.save_policy writes it."""
+        shapes: dict[str, tuple[int, ...]] = {}
+        for network, outputs in (("actor", self.action_dim), ("critic", 1)):
+            sizes = ((self.obs_dim, self.hidden), (self.hidden, self.hidden), (self.hidden, outputs))
+            for layer, (fan_in, fan_out) in zip(LAYERS, sizes, strict=True):
+                shapes |= {f"{network}.{layer}.weight": (fan_in, fan_out), f"{network}.{layer}.bias": (fan_out,)}
+        return shapes | {"log_std": (self.action_dim,), "obs_mean": (self.obs_dim,), "obs_std": (self.obs_dim,)}
 
 
-LANDER = Task(
-    environment="LunarLanderContinuous-v3",
-    tensors={
-        "mean.0.weight": (64, 8),
-        "mean.0.bias": (64,),
-        "mean.2.weight": (64, 64),
-        "mean.2.bias": (64,),
-        "mean.4.weight": (2, 64),
-        "mean.4.bias": (2,),
-        "log_std": (2,),
-    },
-    layers=("mean.0", "mean.2", "mean.4"),
-)
-TASKS = {"lander": LANDER}
+LAYERS = ("0", "1", "out")
+TASKS = {"lander": Task("LunarLanderContinuous-v3", obs_dim=8, action_dim=2, hidden=64)}
 
 
 class RefusedFile(ValueError):
@@ -75,6 +70,8 @@ def read_weights(content: bytes, task: Task) -> dict[str, np.ndarray]:
     for name, tensor in weights.items():
         if not np.isfinite(tensor).all():
             raise RefusedFile(f"{name} holds numbers that are not finite (NaN or infinite): training has diverged")
+    if not (weights["obs_std"] > 0).all():
+        raise RefusedFile("obs_std, by which observations are divided, holds a number that is not positive")
     return weights
 
 
@@ -85,7 +82,7 @@ def _size(task: Task) -> int:
 def _entries(content: bytes) -> dict[str, Any]:
     """The file's table of tensors. The parser that reads the numbers takes the last of two equal names; here they are refused."""
     if content[:4] == b"PK\x03\x04" or content[:1] == b"\x80":
-        raise RefusedFile("it is a pickle, which can run code when it is read: write it with safetensors.torch.save_file")
+        raise RefusedFile("it is a pickle, which can run code when it is read: write it with course_lib.policies.save_policy")
     length = int.from_bytes(content[:8], "little")
     try:
         entries = json.loads(content[8 : 8 + length].decode(), object_pairs_hook=_without_repetition)
@@ -102,12 +99,12 @@ def _entries(content: bytes) -> dict[str, Any]:
 def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     entries = dict(pairs)
     if len(entries) < len(pairs):
-        raise RefusedFile("its table names something twice: write it with safetensors.torch.save_file")
+        raise RefusedFile("its table names something twice: write it with course_lib.policies.save_policy")
     return entries
 
 
 def _not_safetensors() -> RefusedFile:
-    return RefusedFile("it is no safetensors file, or only a part of one: write it with safetensors.torch.save_file")
+    return RefusedFile("it is no safetensors file, or only a part of one: write it with course_lib.policies.save_policy")
 
 
 def _expect_names(entries: Mapping[str, Any], task: Task) -> None:
@@ -125,16 +122,16 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else text[:60] + "…"
 
 
-def act(weights: Mapping[str, np.ndarray], observations: np.ndarray, task: Task) -> np.ndarray:
-    """The policy's mean actions, clipped to [-1, 1]: (N, observations) → (N, actions), float32.
+def act(weights: Mapping[str, np.ndarray], observations: np.ndarray) -> np.ndarray:
+    """The policy's likeliest actions, clipped to [-1, 1] as the environment would: (N, observations) → (N, actions), float32.
 
     Computed in double precision. There no finite float32 weights can overflow, and what two machines round differently is gone when the
     actions become float32 again, so that the same file lands alike on both.
     """
-    hidden = observations.astype(np.float64)
-    for layer in task.layers:
-        hidden = hidden @ weights[f"{layer}.weight"].astype(np.float64).T + weights[f"{layer}.bias"]
-        if layer != task.layers[-1]:
+    hidden = (observations.astype(np.float64) - weights["obs_mean"]) / weights["obs_std"]
+    for layer in LAYERS:
+        hidden = hidden @ weights[f"actor.{layer}.weight"].astype(np.float64) + weights[f"actor.{layer}.bias"]
+        if layer != LAYERS[-1]:
             hidden = np.tanh(hidden)
     return np.clip(hidden, -1, 1).astype(np.float32)
 
@@ -154,7 +151,7 @@ def fly(weights: Mapping[str, np.ndarray], seeds: Sequence[int], task: Task) -> 
     returns, flying = np.zeros(len(envs)), np.ones(len(envs), dtype=bool)
     while flying.any():
         aloft = np.flatnonzero(flying)
-        for index, action in zip(aloft, act(weights, observations[aloft], task), strict=True):
+        for index, action in zip(aloft, act(weights, observations[aloft]), strict=True):
             observations[index], reward, terminated, truncated, _ = envs[index].step(action)
             returns[index] += float(reward)
             flying[index] = not (terminated or truncated)
