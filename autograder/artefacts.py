@@ -20,11 +20,11 @@ import course_lib.flight
 from autograder import intake
 from autograder.paths import ROOT
 from autograder.spec import Artefact, Exercise
+from autograder.verdicts import RECEIPT
 from course_lib import artefact as frozen
 from course_lib.artefact import FrozenArtefact
 from course_lib.diagnosis import Finding
 
-RECEIPT = "handed_in: "  # begins the flag that says which file was flown: `handed_in: NAME sha256 HEX`
 PROGRAM = Path(course_lib.flight.__file__)
 THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -70,7 +70,7 @@ def judge(artefact: FrozenArtefact, folder: Path, timeout: float) -> tuple[Findi
       folder: the submission's.
       timeout: seconds.
 
-    Returns: the finding, and flags: a receipt for the file that was read.
+    Returns: the finding, and flags: a receipt for the file that was read, and whether it is the one that the course publishes.
     Raises: FlightFailed if our own program fails.
     """
     try:
@@ -82,6 +82,8 @@ def judge(artefact: FrozenArtefact, folder: Path, timeout: float) -> tuple[Findi
     except OSError as error:
         return frozen.refused(artefact, f"it can't be read ({error.strerror})"), []
     flags = [f"{RECEIPT}{artefact.file} sha256 {hashlib.sha256(content).hexdigest()}"]
+    if answer(artefact).is_file() and answer(artefact).read_bytes() == content:
+        flags.append(f"the_courses_own_file: {artefact.file}")
     return _flown(artefact, content, timeout), flags
 
 

@@ -179,7 +179,7 @@ def _exercise_rows(assignment: str, name: str) -> dict:
     from autograder import checks, killmatrix
 
     torch.set_num_threads(1)
-    exercise = next(exercise for exercise in checks.exercises(assignment) if exercise.name == name)
+    exercise = next(exercise for exercise in checks.functions(assignment) if exercise.name == name)
     return dataclasses.asdict(killmatrix.exercise_rows(exercise))
 
 
