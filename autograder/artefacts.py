@@ -24,6 +24,7 @@ from autograder.verdicts import RECEIPT
 from course_lib import artefact as frozen
 from course_lib.artefact import FrozenArtefact
 from course_lib.diagnosis import Finding
+from course_lib.flight import RefusedFile
 
 PROGRAM = Path(course_lib.flight.__file__)
 THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -84,19 +85,27 @@ def judge(artefact: FrozenArtefact, folder: Path, timeout: float) -> tuple[Findi
     flags = [f"{RECEIPT}{artefact.file} sha256 {hashlib.sha256(content).hexdigest()}"]
     if answer(artefact).is_file() and answer(artefact).read_bytes() == content:
         flags.append(f"the_courses_own_file: {artefact.file}")
-    return _flown(artefact, content, timeout), flags
-
-
-def _flown(artefact: FrozenArtefact, content: bytes, timeout: float) -> Finding:
-    command = [sys.executable, "-I", str(PROGRAM), artefact.task, *map(str, artefact.seeds)]
     try:
-        ended = subprocess.run(command, input=content, capture_output=True, timeout=timeout, env=THREADS)
+        finding = frozen.landed(artefact, fly(artefact, content, timeout))
+    except RefusedFile as refusal:
+        finding = frozen.refused(artefact, str(refusal))
     except subprocess.TimeoutExpired:
-        return Finding(artefact.name, "timeout", 0.0, artefact.points, message=f"The flights took more than {timeout:g} s.")
+        message = f"The flights took more than {timeout:g} s."
+        finding = Finding(artefact.name, "timeout", 0.0, artefact.points, message=message)
+    return finding, flags
+
+
+def fly(artefact: FrozenArtefact, content: bytes, timeout: float) -> np.ndarray:
+    """The returns, (episodes,), of the file with this content, flown in a process of its own.
+
+    Raises: RefusedFile if it is no policy; subprocess.TimeoutExpired; FlightFailed if our own program fails.
+    """
+    command = [sys.executable, "-I", str(PROGRAM), artefact.task, *map(str, artefact.seeds)]
+    ended = subprocess.run(command, input=content, capture_output=True, timeout=timeout, env=THREADS)
     if ended.returncode:
         reason = ended.stderr.decode(errors="replace").strip().rpartition("\n")[2]
         raise FlightFailed(f"{PROGRAM.name} ended with {ended.returncode}: {reason[:200]}")
     told = json.loads(ended.stdout)
     if "refused" in told:
-        return frozen.refused(artefact, told["refused"])
-    return frozen.landed(artefact, np.array(told["returns"]))
+        raise RefusedFile(told["refused"])
+    return np.array(told["returns"])

@@ -145,10 +145,11 @@ def read_regular(path: Path, limit: int) -> bytes:
         if path.is_symlink():
             raise BadFile("is a link; hand in the file itself") from None
         raise error
+    status = os.fstat(descriptor)
+    if not stat.S_ISREG(status.st_mode):
+        os.close(descriptor)
+        raise BadFile("is not a regular file")
     with os.fdopen(descriptor, "rb") as file:
-        status = os.fstat(file.fileno())
-        if not stat.S_ISREG(status.st_mode):
-            raise BadFile("is not a regular file")
         if status.st_size > limit:
             allowed = f"{limit >> 20} MB: clear its outputs and save it again" if limit == MAX_NOTEBOOK else f"{limit >> 10} kB"
             raise BadFile(f"is larger than {allowed}")

@@ -96,8 +96,8 @@ class Artefact:
 
     It stands in EXERCISES and has a stub in its chapter like any other, but what the stub's function does is never looked at: the grader
     flies `file` as the task `task` (course_lib.flight.TASKS) from `episodes` seeds that nobody has seen, learners from
-    `visible_episodes` others. `thresholds` are the mean returns that earn nothing and everything; autograder.calibration says how
-    they were found. The file that the reference made lies in solutions/.
+    `visible_episodes` others. `thresholds` are the mean returns that earn nothing and everything. The file that the reference made lies
+    in solutions/.
     """
 
     name: str
@@ -108,6 +108,9 @@ class Artefact:
     thresholds: tuple[float, float]
     episodes: int = 100
     visible_episodes: int = 20
+    experiment: str = ""  # whose agents show that the thresholds are right: autograder.calibration
+    right: Sequence[str] = ()  # its variants that were trained rightly
+    wrong: Mapping[str, str] = field(default_factory=dict)  # and those that were not: variant -> what is wrong
 
     @property
     def criteria(self) -> dict[str, float]:
