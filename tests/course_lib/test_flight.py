@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from course_lib import flight
+from course_lib import flight, policies
 
 LANDER = flight.TASKS["lander"]
 
@@ -75,17 +75,20 @@ def test_a_number_that_is_not_finite_is_refused(weights, value):
 
 
 def test_a_large_file_is_not_parsed():
-    assert refusal(b"x" * (flight.MAX_BYTES + 1)) == "it is larger than 256 kB, and the task's policy needs 38 kB"
+    assert refusal(b"x" * (flight.MAX_BYTES + 1)) == "it is larger than 256 kB, and the task's policy needs 37 kB"
 
 
-def test_actions_are_those_of_the_courses_policies(weights):
-    policies = pytest.importorskip("course_lib.policies")
-    assert {
-        "obs_dim": LANDER.obs_dim,
-        "action_dim": LANDER.action_dim,
-        "discrete": False,
-        "hidden": LANDER.hidden,
-    } == policies.LANDER
+def test_a_policy_of_the_course_is_read_and_acts_as_it_does_itself(tmp_path):
+    policy = policies.make_policy(**policies.LANDER, log_std=-1.0, seed=3)
+    policy.tensors()["actor.out.weight"].mul_(100)  # a new policy does almost nothing
+    policy.obs_mean[:] = 0.3
+    policy.obs_std[:] = 1.7
+    policies.save_policy(policy, tmp_path / "policy.safetensors")
+    obs = np.random.default_rng(0).normal(size=(500, 8)).astype(np.float32)
+    seen = flight.act(flight.read_weights((tmp_path / "policy.safetensors").read_bytes(), LANDER), obs)
+    wanted = policy.best_action(obs).numpy().clip(-1, 1)
+    assert 0.1 < np.mean(np.abs(wanted) == 1) < 0.9  # so that both what is clipped and what is not are seen
+    np.testing.assert_allclose(seen, wanted, atol=1e-4)
 
 
 def test_the_largest_weights_give_finite_actions(weights):
