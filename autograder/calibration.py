@@ -62,13 +62,14 @@ def groups(artefact: Artefact, runs: Path | None = None) -> list[Group]:
     """Fly all agents of the artefact's experiment that were trained for this, on all cores, once for each state of their files.
 
     Args:
-      artefact: its `experiment` has the variants in `right` and `wrong`.
+      artefact: its `experiment` has a variant `right`, and others with a `mistake` in their configurations.
       runs: the folder of all experiments' records; found by itself if not given.
 
     Raises: records.RecordsError if agents are missing.
     """
     known = records.load(artefact.experiment, runs)
-    wanted = dict.fromkeys(artefact.right, "") | dict(artefact.wrong)
+    mistakes = {variant: known.configuration(variant).get("mistake", "") for variant in known.variants}
+    wanted = {variant: mistake for variant, mistake in mistakes.items() if mistake or variant == artefact.right}
     files = {variant: [known.artefact(variant, seed, "safetensors") for seed in known.seeds(variant)] for variant in wanted}
     judged = artefacts.hidden(artefact)
     inputs = [artefacts.PROGRAM, ROOT / "constraints.txt", *(path for paths in files.values() for path in paths)]

@@ -1,10 +1,15 @@
 """The statistics behind thresholds, and the bar that every artefact's must pass."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import safetensors.numpy
 
-from autograder import calibration, checks
+from autograder import artefacts, calibration, checks
 from autograder.spec import Artefact
+from course_lib import records
+from course_lib.flight import TASKS
 
 ARTEFACTS = [exercise for exercise in checks.all_exercises() if isinstance(exercise, Artefact)]
 
@@ -51,6 +56,27 @@ def test_a_row_counts_full_and_half_points():
     assert (first.agents, first.full, first.half) == (20, 20, 20) and first.chance < 0.01
     assert (second.full, second.half) == (0, 0) and second.chance < 0.01
     assert first.least <= first.middle <= first.most and first.middle == pytest.approx(260, abs=5)
+
+
+def test_the_agents_of_an_experiment_are_flown_once_as_the_judge_flies(tmp_path, monkeypatch):
+    policy = safetensors.numpy.save({name: np.full(shape, 0.01, np.float32) for name, shape in TASKS["lander"].tensors.items()})
+    for variant, configuration in (("ours", {}), ("broken_sign", {"mistake": "It descends."}), ("no_clip", {})):
+        for seed in range(2 if variant == "ours" else 1):
+            provenance = {"variant": variant, "seed": seed, "configuration": configuration}
+            records.write(tmp_path / "runs" / "lander" / f"{variant}-{seed}.parquet", [{"env_steps": 1}], provenance)
+            (tmp_path / "runs" / "lander" / f"{variant}-{seed}.safetensors").write_bytes(policy)
+    monkeypatch.setattr(calibration, "cache_folder", lambda: tmp_path)
+    train = Artefact("train", lambda: None, "f", "lander", 4.0, (0.0, 200.0), episodes=3, experiment="lander")
+    found = {group.variant: group for group in calibration.groups(train, tmp_path / "runs")}
+    assert {variant: (group.mistake, group.returns.shape) for variant, group in found.items()} == {
+        "broken_sign": ("It descends.", (1, 3)),
+        "ours": ("", (2, 3)),
+    }
+    judged, _ = artefacts.judge(replace(artefacts.hidden(train), file="ours-0.safetensors"), tmp_path / "runs" / "lander", 60)
+    assert f"Mean return {found['ours'].returns[0].mean():.1f} over 3 episodes" in judged.message
+    monkeypatch.setattr(artefacts, "fly", None)
+    again = {group.variant: group for group in calibration.groups(train, tmp_path / "runs")}
+    assert np.array_equal(again["ours"].returns, found["ours"].returns)
 
 
 @pytest.mark.parametrize("artefact", ARTEFACTS, ids=lambda artefact: artefact.name)
