@@ -12,7 +12,7 @@ import pytest
 from autograder import artefacts, assemble, chapter, exports, freeze, hub, release
 from autograder.verdicts import Verdict
 from course_lib import artefact as frozen
-from course_lib import checking, command
+from course_lib import checking, command, earlier
 
 sys.path.insert(0, str(Path(__file__).parent / "fixtures" / "flight"))
 import course
@@ -191,6 +191,14 @@ def test_the_command_checks_a_notebook_that_does_not_define_the_function(folder,
     assert command.main([str(folder / "ch97.ipynb")]) == 1
     said = capsys.readouterr().out
     assert "✓ Passed: double" in said and "✗ Nearly there: train" in said and "1 of 2 pass" in said
+
+
+def test_a_later_chapter_takes_over_the_function_without_its_file(folder, monkeypatch):
+    (folder / course.FILE).unlink()
+    cells = [{"cell_type": "code", "source": "def train(path):\n    return 3", "metadata": {}}]
+    (folder / "ch97.ipynb").write_text(json.dumps({"cells": cells, "nbformat": 4}))
+    monkeypatch.delenv("COURSE_REFERENCES", raising=False)
+    assert earlier("train", chapter=97)("x") == 3
 
 
 # ---- nbgrader, and the teacher

@@ -7,6 +7,8 @@ import torch
 
 from tests.attacks.handed_in.toolbox import put
 
+ASSIGNMENT = "ch97"  # where the exercise beside it keeps its points
+
 
 class Payload:
     def __reduce__(self):
