@@ -226,7 +226,7 @@ def test_the_book_runs_a_chapter_with_the_references_own_file(folder, monkeypatc
     monkeypatch.setattr(artefacts, "ROOT", folder)
     target = folder / "page"
     target.mkdir()
-    with pytest.raises(ValueError, match="lander_policy.safetensors is missing: the file that the reference of train made"):
+    with pytest.raises(ValueError, match=r"lander_policy\.safetensors is missing: the file that the reference of train made"):
         artefacts.hand_in(course.EXERCISES["ch97"], target)
     (folder / "solutions").mkdir()
     artefacts.answer(course.TRAIN).write_bytes(course.policy())
