@@ -131,6 +131,7 @@ def test_a_files_points_do_not_depend_on_the_graders_environment(folder, monkeyp
 
 
 def test_the_notebook_says_what_the_points_are_for_and_has_the_locked_check():
+    assemble.verify(PAGE, SOURCES)
     notebook = assemble.student_view(PAGE, sources=SOURCES)
     text = "\n".join(cell.source for cell in notebook.cells)
     assert "**4 points:** for the file `lander_policy.safetensors`, handed in beside the notebook." in text
