@@ -19,7 +19,7 @@ HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 
 
 def _normal(generator, *shape):
-    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+    return torch.randn(shape, generator=generator, dtype=torch.float64)
 
 
 def _with(inputs, **changes):
@@ -430,7 +430,7 @@ def _epochs(batch_size, minibatch_size):
 
 
 def _epoch_case(name, batch_size, minibatch_size, **options):
-    """Two calls with one generator, then what became of the generator itself."""
+    """Two epochs with one generator."""
     return Case(name, _epochs(batch_size, minibatch_size), repeat=2, view="epochs", **options)
 
 
@@ -514,6 +514,7 @@ MINIBATCHES = Exercise(
         _epoch_case("one batch for all", 40, 40),
         _epoch_case("a batch larger than the data", 40, 64, visible=True),
         _epoch_case("single samples", 30, 1),
+        Case("what is drawn from", _epochs(64, 16), returns=("generator",), view="drawn_from", visible=True, draws=1),
     ),
     misconceptions=(
         Misconception(
