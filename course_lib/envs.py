@@ -27,6 +27,14 @@ def make(name, num_envs, **env_kwargs):
     return gym.make_vec(name, num_envs, vectorization_mode="sync", vector_kwargs=options, **env_kwargs)
 
 
+def begun(envs, seed, steps=0, action=0.0):
+    """The environments after a reset with this seed and some steps in which every component of every action is `action`."""
+    envs.reset(seed=seed)
+    for _ in range(steps):
+        envs.step(np.full(envs.action_space.shape, action, np.float32))
+    return envs
+
+
 class TimerVectorEnv(gym.vector.VectorEnv):
     """Episodes of fixed lengths, and a reward of 1 a step: every value and advantage can be worked out by hand.
 
@@ -231,7 +239,7 @@ class HoverVectorEnv(gym.vector.VectorEnv):
         """Start all episodes."""
         super().reset(seed=seed)
         self._start(np.ones(self.num_envs, dtype=bool))
-        return self._observations(), {}
+        return self.observe(), {}
 
     def step(self, actions):
         """Move every drone by one step; see the class for what ends an episode."""
@@ -247,16 +255,17 @@ class HoverVectorEnv(gym.vector.VectorEnv):
         if ended.any():
             info = {"final_obs": self.states.copy(), "_final_obs": ended}
             self._start(ended)
-        return self._observations(), np.exp(-2 * heights**2), terminated, truncated, info
+        return self.observe(), np.exp(-2 * heights**2), terminated, truncated, info
+
+    def observe(self):
+        """Height and speed of every drone, (N, 2): with copy=False, the array itself."""
+        return self.states.copy() if self.copy else self.states
 
     def _start(self, which):
         count = which.sum()
         self.states[which, 0] = self.np_random.uniform(-1.5, 1.5, count)
         self.states[which, 1] = 0.5 * self.np_random.standard_normal(count)
         self.elapsed[which] = 0
-
-    def _observations(self):
-        return self.states.copy() if self.copy else self.states
 
 
 class BalanceTask:

@@ -64,3 +64,10 @@ def drawn_from(arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) 
     """
     untouched = torch.Generator().manual_seed(arguments["generator"]["arguments"]["seed"]).get_state().numpy()
     return {"drawn": np.asarray(not np.array_equal(outputs[""], untouched))}
+
+
+def steps_made(_arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """How many steps an optimiser has made, of all that it holds: what depends on a random order is left out."""
+    if "steps" not in outputs:
+        raise ValueError("there is no number of steps")
+    return {"steps": outputs["steps"]}

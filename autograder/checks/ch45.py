@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 import math
 
+import numpy as np
 import torch
 from torch.distributions import Independent, Normal
 
 from autograder.spec import Case, Exercise, Misconception
-from course_lib import validate
+from course_lib import envs as environments
 from course_lib.cases import built
+from course_lib.rollouts import Rollout, true_next_obs
 from solutions import ch45
 
 INF = math.inf
@@ -34,6 +37,11 @@ def _changed(inputs, **changes):
         return drawn | {name: change(drawn[name]) for name, change in changes.items()}
 
     return wrong
+
+
+def _case(name, inputs, **options):
+    """A case of which one hidden draw is enough, since others ask for the same."""
+    return Case(name, inputs, **({"draws": 1} | options))
 
 
 # ---------------------------------------------------------------------------------------------- wrong answers, in general
@@ -134,36 +142,33 @@ GAUSSIAN_LOG_PROB = Exercise(
     criteria={"values": 0.65, "gradient": 0.15, "dtype": 0.05, "inputs": 0.05, "errors": 0.1},
     axes=("sample",),
     cases=(
-        Case("log_std of shape (A,)", _actions(), closed_form=_density_by_hand, visible=True, draws=3),
-        Case("log_std of shape (B, A)", _actions(per_sample=True), closed_form=_density_by_hand, visible=True),
-        Case("actions at the mean", _at_the_mean, closed_form=_mode_density, visible=True),
-        Case("a single action dimension", _actions(dims=1), closed_form=_density_by_hand, visible=True),
-        Case("as many samples as dimensions", _actions(size=4, dims=4), closed_form=_density_by_hand),
-        Case("twenty dimensions, far from the mean", _actions(dims=20, spread=12.0), closed_form=_density_by_hand, visible=True),
-        Case("a very wide policy", _actions(base=4.0), closed_form=_density_by_hand),
-        Case("mean and log_std require gradient", _actions(), differentiate=("mean", "log_std"), visible=True),
-        Case("log_std (B, A) requires gradient", _actions(per_sample=True), differentiate=("mean", "log_std")),
-        Case("single precision", _actions(), dtype=torch.float32, visible=True),
-        Case(
+        _case("log_std of shape (A,)", _actions(), closed_form=_density_by_hand, visible=True, draws=2),
+        _case("log_std of shape (B, A)", _actions(per_sample=True), closed_form=_density_by_hand, visible=True),
+        _case("actions at the mean", _at_the_mean, closed_form=_mode_density, visible=True),
+        _case("a single action dimension", _actions(dims=1), closed_form=_density_by_hand, visible=True),
+        _case("as many samples as dimensions", _actions(size=4, dims=4), closed_form=_density_by_hand),
+        _case("twenty dimensions, far from the mean", _actions(dims=20, spread=12.0), closed_form=_density_by_hand, visible=True),
+        _case("a very wide policy", _actions(base=4.0), closed_form=_density_by_hand),
+        _case("mean and log_std require gradient", _actions(), differentiate=("mean", "log_std"), visible=True),
+        _case("log_std (B, A) requires gradient", _actions(per_sample=True), differentiate=("mean", "log_std")),
+        _case("single precision", _actions(), dtype=torch.float32, visible=True),
+        _case(
             "actions with a dimension too few",
             _changed(_actions(), actions=lambda a: a[:, :1]),
             raises=("actions", "mean"),
             visible=True,
-            draws=1,
         ),
-        Case("actions of one sample", _changed(_actions(), actions=lambda a: a[:1]), raises=("actions", "mean"), draws=1),
-        Case(
+        _case("actions of one sample", _changed(_actions(), actions=lambda a: a[:1]), raises=("actions", "mean")),
+        _case(
             "log_std for another number of dimensions",
             _changed(_actions(), log_std=lambda s: s[:1]),
             raises=("log_std",),
             visible=True,
-            draws=1,
         ),
-        Case(
+        _case(
             "log_std as a column, one for each sample",
             _changed(_actions(per_sample=True), log_std=lambda s: s[:, :1]),
             raises=("log_std",),
-            draws=1,
         ),
     ),
     misconceptions=(
@@ -321,15 +326,15 @@ GAUSSIAN_ENTROPY = Exercise(
     criteria={"values": 0.7, "gradient": 0.2, "dtype": 0.05, "inputs": 0.05},
     axes=("sample",),
     cases=(
-        Case("(A,)", _widths(3), closed_form=_negated_mean_log_density, visible=True, draws=3),
-        Case("(B, A)", _widths(5, 3), closed_form=_negated_mean_log_density, visible=True),
-        Case("as many samples as dimensions", _widths(3, 3), closed_form=_negated_mean_log_density),
-        Case("one dimension", _widths(1), closed_form=_negated_mean_log_density, visible=True),
-        Case("a very narrow policy: negative", _widths(2, base=-6.0), closed_form=_negated_mean_log_density, visible=True),
-        Case("a very wide policy", _widths(2, base=5.0), closed_form=_negated_mean_log_density),
-        Case("requires gradient", _widths(3), differentiate=("log_std",), visible=True),
-        Case("(B, A) requires gradient", _widths(5, 3), differentiate=("log_std",)),
-        Case("single precision", _widths(3), dtype=torch.float32, visible=True),
+        _case("(A,)", _widths(3), closed_form=_negated_mean_log_density, visible=True, draws=2),
+        _case("(B, A)", _widths(5, 3), closed_form=_negated_mean_log_density, visible=True),
+        _case("as many samples as dimensions", _widths(3, 3), closed_form=_negated_mean_log_density),
+        _case("one dimension", _widths(1), closed_form=_negated_mean_log_density, visible=True),
+        _case("a very narrow policy: negative", _widths(2, base=-6.0), closed_form=_negated_mean_log_density, visible=True),
+        _case("a very wide policy", _widths(2, base=5.0), closed_form=_negated_mean_log_density),
+        _case("requires gradient", _widths(3), differentiate=("log_std",), visible=True),
+        _case("(B, A) requires gradient", _widths(5, 3), differentiate=("log_std",)),
+        _case("single precision", _widths(3), dtype=torch.float32, visible=True),
     ),
     misconceptions=(
         Misconception(
@@ -407,9 +412,7 @@ GAUSSIAN_ENTROPY = Exercise(
     variants={
         "torch.distributions": lambda log_std: Normal(torch.zeros_like(log_std), log_std.exp()).entropy().sum(-1),
         "Independent": lambda log_std: Independent(Normal(torch.zeros_like(log_std), log_std.exp()), 1).entropy(),
-        "constant outside the sum": lambda log_std: (
-            log_std.sum(dim=-1) + log_std.shape[-1] * 0.5 * (1 + math.log(2 * math.pi))
-        ),
+        "constant outside the sum": lambda log_std: log_std.sum(dim=-1) + log_std.shape[-1] * 0.5 * (1 + math.log(2 * math.pi)),
         "half of a logarithm": lambda log_std: 0.5 * torch.log(2 * math.pi * math.e * torch.exp(2 * log_std)).sum(-1),
         "one dimension after the other": lambda log_std: sum(
             log_std[..., i] + 0.5 * math.log(2 * math.pi * math.e) for i in range(log_std.shape[-1])
@@ -431,7 +434,19 @@ def _epochs(batch_size, minibatch_size):
 
 def _epoch_case(name, batch_size, minibatch_size, **options):
     """Two epochs with one generator."""
-    return Case(name, _epochs(batch_size, minibatch_size), repeat=2, view="epochs", **options)
+    return _case(name, _epochs(batch_size, minibatch_size), repeat=2, view="epochs", **options)
+
+
+def _sized(version):
+    """A version of the function that refuses what the reference refuses."""
+
+    def checked(batch_size, minibatch_size, generator):
+        for name, size in (("batch_size", batch_size), ("minibatch_size", minibatch_size)):
+            if not size > 0:
+                raise ValueError(f"{name} is {size}, but it counts samples and must be positive")
+        return version(batch_size, minibatch_size, generator)
+
+    return checked
 
 
 def _order(order, drop_last=False):
@@ -442,40 +457,46 @@ def _order(order, drop_last=False):
             if not drop_last or len(batch) == minibatch_size:
                 yield batch
 
-    return version
+    return _sized(version)
 
 
 def _permutation(size, generator):
     return torch.randperm(size, generator=generator)
 
 
+@_sized
 def _with_replacement_between_batches(batch_size, minibatch_size, generator):
     for start in range(0, batch_size, minibatch_size):
         yield torch.randperm(batch_size, generator=generator)[: min(minibatch_size, batch_size - start)]
 
 
+@_sized
 def _last_batch_filled_up(batch_size, minibatch_size, generator):
     order = torch.randperm(batch_size, generator=generator)
     missing = -batch_size % minibatch_size
     return iter(torch.cat([order, order[:missing]]).split(minibatch_size))
 
 
+@_sized
 def _shuffled_within(batch_size, minibatch_size, generator):
     for block in torch.arange(batch_size).split(minibatch_size):
         yield block[torch.randperm(len(block), generator=generator)]
 
 
+@_sized
 def _batches_shuffled(batch_size, minibatch_size, generator):
     blocks = torch.arange(batch_size).split(minibatch_size)
     return iter([blocks[i] for i in torch.randperm(len(blocks), generator=generator)])
 
 
+@_sized
 def _equal_parts(batch_size, minibatch_size, generator):
     """As many batches as asked for, of equal sizes rather than of the size asked for."""
     count = -(-batch_size // minibatch_size)
     return iter(torch.randperm(batch_size, generator=generator).tensor_split(count))
 
 
+@_sized
 def _fisher_yates(batch_size, minibatch_size, generator):
     order = list(range(batch_size))
     for last in range(batch_size - 1, 0, -1):
@@ -485,11 +506,13 @@ def _fisher_yates(batch_size, minibatch_size, generator):
         yield torch.tensor(order[start : start + minibatch_size])
 
 
+@_sized
 def _by_sorting(batch_size, minibatch_size, generator):
     order = torch.rand(batch_size, generator=generator, dtype=torch.float64).argsort()
     return (order[start : start + minibatch_size] for start in range(0, batch_size, minibatch_size))
 
 
+@_sized
 def _by_popping(batch_size, minibatch_size, generator):
     left = _permutation(batch_size, generator)
     while len(left):
@@ -497,6 +520,7 @@ def _by_popping(batch_size, minibatch_size, generator):
         left = left[minibatch_size:]
 
 
+@_sized
 def _by_data_loader(batch_size, minibatch_size, generator):
     sampler = torch.utils.data.RandomSampler(range(batch_size), generator=generator)
     for batch in torch.utils.data.BatchSampler(sampler, minibatch_size, drop_last=False):
@@ -506,15 +530,18 @@ def _by_data_loader(batch_size, minibatch_size, generator):
 MINIBATCHES = Exercise(
     name="minibatches",
     reference=ch45.minibatches,
-    criteria={"values": 1.0},
+    criteria={"values": 0.9, "errors": 0.1},
     cases=(
-        _epoch_case("two epochs of 64 in batches of 16", 64, 16, visible=True, draws=3),
+        _epoch_case("two epochs of 64 in batches of 16", 64, 16, visible=True, draws=2),
         _epoch_case("a short last batch", 50, 16, visible=True),
         _epoch_case("one sample is left over", 33, 8, visible=True),
         _epoch_case("one batch for all", 40, 40),
         _epoch_case("a batch larger than the data", 40, 64, visible=True),
         _epoch_case("single samples", 30, 1),
-        Case("what is drawn from", _epochs(64, 16), returns=("generator",), view="drawn_from", visible=True, draws=1),
+        _case("what is drawn from", _epochs(64, 16), returns=("generator",), view="drawn_from", visible=True),
+        _case("batch_size = 0", _epochs(0, 16), raises=("batch_size",), visible=True),
+        _case("minibatch_size = 0", _epochs(16, 0), raises=("minibatch_size",)),
+        _case("minibatch_size = -1", _epochs(16, -1), raises=("minibatch_size",)),
     ),
     misconceptions=(
         Misconception(
@@ -570,7 +597,7 @@ MINIBATCHES = Exercise(
         ),
         Misconception(
             "one-tensor",
-            lambda batch_size, minibatch_size, generator: torch.randperm(batch_size, generator=generator),
+            _sized(lambda batch_size, _, generator: torch.randperm(batch_size, generator=generator)),
             "This is the whole order in one tensor: yield it piece by piece, minibatch_size indices at a time.",
         ),
         Misconception(
@@ -584,6 +611,11 @@ MINIBATCHES = Exercise(
             "Index tensors are int64 by contract.",
         ),
         Misconception(
+            "bad-input-accepted",
+            lambda size, minibatch_size, generator: torch.randperm(size, generator=generator).split(abs(minibatch_size) or size),
+            "Sizes below 1 make no minibatches: raise a ValueError that names the argument and its value.",
+        ),
+        Misconception(
             "counted-from-one",
             lambda *given: (batch + 1 for batch in ch45.minibatches(*given)),
             "Indices run from 0 to batch_size - 1.",
@@ -594,8 +626,8 @@ MINIBATCHES = Exercise(
         "sorting random numbers": _by_sorting,
         "taking from what is left": _by_popping,
         "torch's samplers": _by_data_loader,
-        "a list of slices": lambda batch_size, minibatch_size, generator: list(
-            _permutation(batch_size, generator).split(minibatch_size)
+        "a list of slices": _sized(
+            lambda batch_size, minibatch_size, generator: list(_permutation(batch_size, generator).split(minibatch_size))
         ),
     },
 )
@@ -812,27 +844,32 @@ PPO_LOSS = Exercise(
     reference=ch45.ppo_loss,
     criteria={"values": 1.2, "gradient": 0.5, "dtype": 0.05, "inputs": 0.05, "errors": 0.2},
     cases=(
-        Case("a minibatch", _update(), closed_form=_loss_by_hand, visible=True, draws=3),
-        Case("one entropy for all", _update(shared_entropy=True), closed_form=_loss_by_hand, visible=True),
-        Case("before the first step, perfect critic", _before_the_first_step, closed_form=_read_off, visible=True),
-        Case("other coefficients", _update(vf_coef=1.7, ent_coef=0.3), closed_form=_loss_by_hand, visible=True),
-        Case("no entropy bonus", _update(ent_coef=0.0), closed_form=_loss_by_hand),
-        Case("no value loss", _update(vf_coef=0.0), closed_form=_loss_by_hand),
-        Case("clip_range = 0.05", _update(clip_range=0.05), closed_form=_loss_by_hand, visible=True),
-        Case("clip_range = infinity", _update(clip_range=INF, spread=1.0), closed_form=_loss_by_hand),
-        Case("very unlikely actions", _update(base=-900.0), closed_form=_loss_by_hand, visible=True),
-        Case("all inputs require gradient", _update(), differentiate=(*_COLUMNS, "entropy"), visible=True),
-        Case(
+        _case("a minibatch", _update(), closed_form=_loss_by_hand, visible=True, draws=2),
+        _case("one entropy for all", _update(shared_entropy=True), closed_form=_loss_by_hand, visible=True),
+        _case("before the first step, perfect critic", _before_the_first_step, closed_form=_read_off, visible=True),
+        _case("other coefficients", _update(vf_coef=1.7, ent_coef=0.3), closed_form=_loss_by_hand, visible=True),
+        _case("no entropy bonus", _update(ent_coef=0.0), closed_form=_loss_by_hand),
+        _case("no value loss", _update(vf_coef=0.0), closed_form=_loss_by_hand),
+        _case("clip_range = 0.05", _update(clip_range=0.05), closed_form=_loss_by_hand, visible=True),
+        _case("clip_range = infinity", _update(clip_range=INF, spread=1.0), closed_form=_loss_by_hand),
+        _case("very unlikely actions", _update(base=-900.0), closed_form=_loss_by_hand, visible=True),
+        _case("all inputs require gradient", _update(), differentiate=(*_COLUMNS, "entropy"), visible=True),
+        _case(
             "gradient with one entropy for all",
             _update(shared_entropy=True, vf_coef=1.7, ent_coef=0.3),
             differentiate=(*_COLUMNS, "entropy"),
         ),
-        Case("single precision", _update(), dtype=torch.float32, visible=True),
-        Case("values as a column", _reshaped("values", lambda v: v[:, None]), raises=_COLUMNS, visible=True, draws=1),
-        Case("returns of one sample", _reshaped("returns", lambda r: r[:1]), raises=_COLUMNS, draws=1),
-        Case("advantages as a column", _reshaped("advantages", lambda a: a[:, None]), raises=_COLUMNS, draws=1),
-        Case("old_log_probs of one sample", _reshaped("old_log_probs", lambda o: o[:1]), raises=_COLUMNS, draws=1),
-        Case("clip_range = -0.1", _with(_update(), clip_range=-0.1), raises=("clip_range",), visible=True, draws=1),
+        _case("single precision", _update(), dtype=torch.float32, visible=True),
+        _case(
+            "entropy of one sample",
+            _reshaped("entropy", lambda h: h[:1]),
+            raises=("entropy",),
+        ),
+        _case("values as a column", _reshaped("values", lambda v: v[:, None]), raises=_COLUMNS, visible=True),
+        _case("returns of one sample", _reshaped("returns", lambda r: r[:1]), raises=_COLUMNS),
+        _case("advantages as a column", _reshaped("advantages", lambda a: a[:, None]), raises=_COLUMNS),
+        _case("old_log_probs of one sample", _reshaped("old_log_probs", lambda o: o[:1]), raises=_COLUMNS),
+        _case("clip_range = -0.1", _with(_update(), clip_range=-0.1), raises=("clip_range",), visible=True),
     ),
     misconceptions=(
         Misconception(
@@ -994,4 +1031,559 @@ PPO_LOSS = Exercise(
     },
 )
 
-EXERCISES = (GAUSSIAN_LOG_PROB, GAUSSIAN_ENTROPY, MINIBATCHES, PPO_LOSS)
+# ------------------------------------------------------------------------------------------------------- collect_rollout
+
+
+def _vector_env(maker, seed, steps=0, action=0.0, **options):
+    """A running vector environment, as an argument, and what it shows."""
+    env = built(f"envs.{maker}", **options)
+    running = environments.begun(getattr(environments, maker)(**options), seed, steps, action)
+    return built("envs.begun", envs=env, seed=seed, steps=steps, action=action), np.array(running.observe())
+
+
+def _collecting(maker, num_steps, log_std=0.5, steps=0, action=0.0, **options):
+    """A rollout of `num_steps` steps with a wide policy; `steps` have been made before."""
+
+    def inputs(generator):
+        seeds = torch.randint(2**31, (3,), generator=generator).tolist()
+        envs, obs = _vector_env(maker, seeds[0], steps, action, **options)
+        shape = {"obs_dim": obs.shape[1], "action_dim": 1, "hidden": 4}
+        return {
+            "envs": envs,
+            "policy": built("policies.make_policy", log_std=log_std, seed=seeds[1], **shape),
+            "num_steps": num_steps,
+            "obs": obs,
+            "generator": built("seeding.generator", seed=seeds[2]),
+        }
+
+    return inputs
+
+
+_LENGTHS = {"lengths": (3, 5, 2), "terminates": (True, False, True)}
+_PAYING = _LENGTHS | {"action_reward": 0.1}
+
+
+def _bounded(envs, actions):
+    return actions.numpy().clip(envs.single_action_space.low, envs.single_action_space.high)
+
+
+def _rollout(
+    act=lambda policy, obs, generator: policy.act(obs, generator),
+    executed=_bounded,
+    successors=lambda obs, info, before: true_next_obs(obs, info),
+    recorded=lambda row: row,
+    last=lambda obs, row: obs,
+    begin=lambda envs, obs: obs,
+    extra_steps=0,
+    finish=lambda rollout: rollout,
+):
+    """A version of the program, from the places where it can go wrong. `recorded` changes a row of the record."""
+
+    def version(envs, policy, num_steps, obs, generator):
+        obs, rows = begin(envs, obs), []
+        for _ in range(num_steps + extra_steps):
+            before = torch.as_tensor(obs, dtype=torch.float32).clone()
+            actions = act(policy, before, generator)
+            obs, rewards, terminated, truncated, info = envs.step(executed(envs, actions))
+            row = {
+                "obs": before,
+                "actions": actions,
+                "rewards": torch.as_tensor(rewards, dtype=torch.float32),
+                "next_obs": torch.as_tensor(successors(obs, info, before), dtype=torch.float32).clone(),
+                "terminated": torch.as_tensor(terminated).clone(),
+                "truncated": torch.as_tensor(truncated).clone(),
+            }
+            row["after"] = torch.as_tensor(obs, dtype=torch.float32).clone()
+            rows.append(recorded(row))
+        final = torch.as_tensor(last(obs, rows[-1]), dtype=torch.float32).clone()
+        names = ("obs", "actions", "rewards", "next_obs", "terminated", "truncated")
+        return finish(Rollout(*(torch.stack([row[name] for row in rows]) for name in names), final))
+
+    return version
+
+
+def _recording(**changes):
+    """A row of the record in which some entries are functions of the row."""
+    return _rollout(recorded=lambda row: row | {name: change(row) for name, change in changes.items()})
+
+
+def _either_end(row):
+    return row["terminated"] | row["truncated"]
+
+
+def _restarted(envs, _obs):
+    return envs.reset(seed=0)[0]
+
+
+def _turned(rollout):
+    return Rollout(*(column.transpose(0, 1) for column in list(vars(rollout).values())[:-1]), rollout.last_obs)
+
+
+def _flattened(rollout):
+    return Rollout(*(column.flatten(0, 1) for column in list(vars(rollout).values())[:-1]), rollout.last_obs)
+
+
+def _own_generator(policy, obs, _generator):
+    return policy.act(obs, torch.Generator().manual_seed(0))
+
+
+_ENDS = "`terminated` and `truncated` are two facts, and one of them decides about the bootstrap: record both as they come."
+_COLLECT_MISTAKES = (
+    Misconception(
+        "next-obs-after-reset",
+        _rollout(successors=lambda obs, info, before: obs),
+        "Where an episode ends, next_obs shows the first observation of the next one: the true last observation is in "
+        'info["final_obs"], and course_lib.rollouts.true_next_obs puts it in its place.',
+    ),
+    Misconception(
+        "next-obs-is-obs",
+        _rollout(successors=lambda obs, info, before: before),
+        "next_obs repeats obs: it is what the step has led to.",
+    ),
+    Misconception(
+        "obs-after-the-step",
+        _recording(obs=lambda row: row["after"]),
+        "obs shows the state after the action: record what the policy saw when it chose.",
+    ),
+    Misconception("truncated-as-terminated", _recording(terminated=_either_end), _ENDS),
+    Misconception("terminated-as-truncated", _recording(truncated=_either_end), _ENDS),
+    Misconception(
+        "ends-swapped", _recording(terminated=lambda row: row["truncated"], truncated=lambda row: row["terminated"]), _ENDS
+    ),
+    Misconception(
+        "clipped-actions-recorded",
+        _recording(actions=lambda row: row["actions"].clamp(-1, 1)),
+        "The actions are recorded as clipped. Their log-probability is then that of another action: record them as sampled.",
+    ),
+    Misconception(
+        "rewards-clipped",
+        _recording(rewards=lambda row: row["rewards"].clamp(-1, 1)),
+        "The rewards are clipped to [-1, 1]: the actions are what has bounds. Record rewards as they come.",
+    ),
+    Misconception(
+        "mean-action",
+        _rollout(act=lambda policy, obs, generator: policy.best_action(obs)),
+        "The actions are the likeliest ones, not samples: without exploration every action is as good as expected.",
+    ),
+    Misconception(
+        "own-generator",
+        _rollout(act=_own_generator),
+        "The actions are drawn from a generator made anew: the same noise at every step. Use the one that is given.",
+    ),
+    Misconception(
+        "restarted",
+        _rollout(begin=_restarted),
+        "The environments are reset at the beginning. A rollout goes on where the last one stopped: start from obs.",
+    ),
+    Misconception(
+        "last-obs-before-reset",
+        _rollout(last=lambda obs, row: row["next_obs"]),
+        "last_obs is the true successor of the last step; where an episode has just ended the environments show the next one's start.",
+    ),
+    Misconception(
+        "one-step-too-many",
+        _rollout(extra_steps=1),
+        "There is a step too many: a rollout has num_steps rows.",
+    ),
+    Misconception("axes-swapped", _rollout(finish=_turned), "Rollouts are time-major: (T, N), not (N, T)."),
+    Misconception("flattened", _rollout(finish=_flattened), "The rows of all environments are in one axis; GAE needs (T, N)."),
+)
+
+COLLECT_ROLLOUT = Exercise(
+    name="collect_rollout",
+    reference=ch45.collect_rollout,
+    criteria={"values": 1.9, "inputs": 0.1},
+    axes=("t", "env"),
+    cases=(
+        _case("episodes of 3, 5 and 2 steps", _collecting("TimerVectorEnv", 7, **_LENGTHS), visible=True),
+        _case("actions that pay", _collecting("TimerVectorEnv", 4, log_std=1.0, **_PAYING), visible=True),
+        _case("a rollout that goes on", _collecting("TimerVectorEnv", 8, steps=1, **_PAYING), visible=True),
+        _case("an end at the last step", _collecting("TimerVectorEnv", 6, **_LENGTHS), visible=True),
+        _case("the drone", _collecting("HoverVectorEnv", 9, num_envs=4, time_limit=5), visible=True),
+        _case("drones that fly away", _collecting("HoverVectorEnv", 12, steps=6, action=1.0, num_envs=3)),
+        _case("a single step", _collecting("HoverVectorEnv", 1, num_envs=2)),
+    ),
+    misconceptions=(
+        *_COLLECT_MISTAKES,
+        Misconception(
+            "actions-not-clipped",
+            _rollout(executed=lambda envs, actions: actions.numpy()),
+            "The environment gets actions beyond its bounds. Clip what is executed, and record what was sampled.",
+        ),
+    ),
+    variants={
+        "memory made beforehand": lambda *given: _into_memory(*given),
+        "columns of arrays": lambda *given: _columns_of_arrays(*given),
+        "successors put in by where": _rollout(
+            successors=lambda obs, info, before: np.where(
+                np.asarray(info.get("_final_obs", np.zeros(len(obs), bool)))[:, None], info.get("final_obs", obs), obs
+            )
+        ),
+        "clipped by torch": _rollout(executed=lambda envs, actions: torch.clamp(actions, -1, 1).numpy()),
+        "a dict": _rollout(finish=lambda rollout: Rollout(**{name: column.clone() for name, column in vars(rollout).items()})),
+    },
+)
+
+
+def _into_memory(envs, policy, num_steps, obs, generator):
+    """A variant: tensors made once, filled row by row."""
+    shape, obs = (num_steps, envs.num_envs), np.array(obs)
+    memory = {name: torch.zeros(*shape, *envs.single_observation_space.shape) for name in ("obs", "next_obs")}
+    memory |= {"actions": torch.zeros(*shape, *envs.single_action_space.shape), "rewards": torch.zeros(shape)}
+    memory |= {name: torch.zeros(shape, dtype=torch.bool) for name in ("terminated", "truncated")}
+    for t in range(num_steps):
+        memory["obs"][t] = torch.tensor(obs)
+        memory["actions"][t] = policy.act(memory["obs"][t], generator)
+        obs, *outcome, info = envs.step(_bounded(envs, memory["actions"][t]))
+        memory["next_obs"][t] = torch.from_numpy(true_next_obs(obs, info))
+        for name, values in zip(("rewards", "terminated", "truncated"), outcome, strict=True):
+            memory[name][t] = torch.as_tensor(values)
+    return Rollout(**memory, last_obs=torch.tensor(obs))
+
+
+def _columns_of_arrays(envs, policy, num_steps, obs, generator):
+    """A variant: lists of arrays, made tensors at the end."""
+    low, high = envs.single_action_space.low, envs.single_action_space.high
+    columns = {name: [] for name in ("obs", "actions", "rewards", "next_obs", "terminated", "truncated")}
+    for _ in range(num_steps):
+        columns["obs"].append(np.array(obs, np.float32))
+        with torch.no_grad():
+            actions = policy.act(columns["obs"][-1], generator).numpy()
+        obs, rewards, terminated, truncated, info = envs.step(np.minimum(np.maximum(actions, low), high))
+        successors = np.array(obs, np.float32)
+        for i in range(len(successors)):
+            if terminated[i] or truncated[i]:
+                successors[i] = info["final_obs"][i]
+        row = (actions, np.float32(rewards), successors, np.array(terminated), np.array(truncated))
+        for name, values in zip(list(columns)[1:], row, strict=True):
+            columns[name].append(values)
+    tensors = {name: torch.from_numpy(np.stack(rows)) for name, rows in columns.items()}
+    return Rollout(**tensors, last_obs=torch.from_numpy(np.array(obs, np.float32)))
+
+
+# ------------------------------------------------------------------------------------------------------------ ppo_update
+
+
+def _updated(size=16, minibatch_size=64, learning_rate=0.01, **settings):
+    """A small policy, and a batch that another has collected. One minibatch for all, so that the order makes no difference."""
+
+    def inputs(generator):
+        seeds = torch.randint(2**31, (2,), generator=generator).tolist()
+
+        def drawn(*shape):
+            return _normal(generator, *shape).float().numpy()
+
+        actions = np.float32(0.6) * drawn(size, 2)
+        mean, log_std = torch.zeros(size, 2), torch.full((2,), -0.5)
+        acted = ch45.gaussian_log_prob(mean, log_std, torch.from_numpy(actions)).numpy()
+        batch = {
+            "obs": drawn(size, 3),
+            "actions": actions,
+            "old_log_probs": acted + np.float32(0.25) * drawn(size),
+            "advantages": drawn(size) + np.float32(0.3),
+            "returns": 2 + drawn(size),
+        }
+        chosen = {"num_epochs": 2, "minibatch_size": minibatch_size, "max_grad_norm": 0.5} | settings
+        return {
+            "policy": built("policies.make_policy", obs_dim=3, action_dim=2, hidden=4, log_std=-0.5, seed=seeds[0]),
+            "optimizer": built("policies.Adam", learning_rate=learning_rate),
+            "batch": built("ppo.Batch", **batch),
+            "settings": built("ppo.PPOSettings", **chosen),
+            "generator": built("seeding.generator", seed=seeds[1]),
+        }
+
+    return inputs
+
+
+def _minibatches_of(batch, settings, generator):
+    return [batch[indices] for indices in ch45.minibatches(len(batch), settings.minibatch_size, generator)]
+
+
+def _coefficients(settings):
+    return settings.clip_range, settings.vf_coef, settings.ent_coef
+
+
+def _averaged(history):
+    return {name: torch.stack([metrics[name] for metrics in history]).mean() for name in history[0]}
+
+
+def _updating(
+    epochs=lambda settings: settings.num_epochs,
+    parts=_minibatches_of,
+    old=lambda rows, log_probs: rows.old_log_probs,
+    weights=lambda rows: rows.advantages,
+    coefficients=_coefficients,
+    clear=lambda policy: setattr(policy.weights, "grad", None),
+    longest=lambda settings: settings.max_grad_norm,
+    stop_at="epoch",
+    summary=_averaged,
+    trained=lambda policy: policy,
+):
+    """A version of the program, from the places where it can go wrong; it stops at the end of an epoch, in its midst, or never."""
+
+    def version(policy, optimizer, batch, settings, generator):
+        policy, history = trained(policy), []
+        for _ in range(epochs(settings)):
+            divergences = []
+            for rows in parts(batch, settings, generator):
+                log_probs, entropy, values = ch45.evaluate_actions(policy, rows.obs, rows.actions)
+                before = old(rows, log_probs)
+                given = (log_probs, before, weights(rows), values, rows.returns, entropy, *coefficients(settings))
+                loss, metrics = ch45.ppo_loss(*given)
+                clear(policy)
+                loss.backward()
+                optimizer.step(policy, longest(settings))
+                history.append(metrics)
+                divergences.append(metrics["approx_kl"].item())
+                if stop_at == "minibatch" and divergences[-1] > settings.target_kl:
+                    return summary(history)
+            if stop_at == "epoch" and sum(divergences) / len(divergences) > settings.target_kl:
+                break
+        return summary(history)
+
+    return version
+
+
+def _normalised_rows(rows):
+    return (rows.advantages - rows.advantages.mean()) / (rows.advantages.std() + 1e-8)
+
+
+def _running_sums(policy, optimizer, batch, settings, generator):
+    """A variant: slices of a permutation, sums in place of lists, the gradient set to zero after the step."""
+    sums, count, epoch, divergence = {}, 0, 0, 0.0
+    while epoch < settings.num_epochs and divergence <= settings.target_kl:
+        order, start, divergence = torch.randperm(len(batch.obs), generator=generator), 0, 0.0
+        while start < len(order):
+            rows = batch[order[start : start + settings.minibatch_size]]
+            log_probs, entropy, values = ch45.evaluate_actions(policy, rows.obs, rows.actions)
+            given = (log_probs, rows.old_log_probs, rows.advantages, values, rows.returns, entropy)
+            loss, metrics = ch45.ppo_loss(*given, *_coefficients(settings))
+            loss.backward()
+            optimizer.step(policy, settings.max_grad_norm)
+            policy.weights.grad.zero_()
+            sums = {name: sums.get(name, 0) + metric for name, metric in metrics.items()}
+            divergence += metrics["approx_kl"].item() * settings.minibatch_size / len(order)
+            start, count = start + settings.minibatch_size, count + 1
+        epoch += 1
+    return {name: total / count for name, total in sums.items()}
+
+
+def _by_autograd(policy, optimizer, batch, settings, generator):
+    """A variant: the gradient is asked for, not left behind."""
+    history = []
+    for _ in range(settings.num_epochs):
+        epoch = []
+        for rows in _minibatches_of(batch, settings, generator):
+            log_probs, entropy, values = ch45.evaluate_actions(policy, rows.obs, rows.actions)
+            given = (log_probs, rows.old_log_probs, rows.advantages, values, rows.returns, entropy)
+            loss, metrics = ch45.ppo_loss(*given, *_coefficients(settings))
+            (policy.weights.grad,) = torch.autograd.grad(loss, policy.weights)
+            optimizer.step(policy, settings.max_grad_norm)
+            epoch.append(metrics)
+        history.extend(epoch)
+        if np.mean([float(metrics["approx_kl"]) for metrics in epoch]) > settings.target_kl:
+            break
+    return _averaged(history)
+
+
+_AFTERWARDS = ("policy", "optimizer")
+_STEPS = {"returns": ("optimizer",), "view": "steps_made"}
+
+PPO_UPDATE = Exercise(
+    name="ppo_update",
+    reference=ch45.ppo_update,
+    criteria={"values": 1.0},
+    cases=(
+        _case(
+            "the policy after two epochs",
+            _updated(clip_range=0.05, vf_coef=0.1, ent_coef=0.2, max_grad_norm=0.1),
+            returns=_AFTERWARDS,
+            visible=True,
+        ),
+        _case("an update that goes too far", _updated(target_kl=1e-4), returns=_AFTERWARDS),
+        _case("the metrics", _updated(), visible=True),
+        _case("the metrics of two minibatches, learning rate 0", _updated(12, 6, learning_rate=0.0), visible=True),
+        _case("steps, where the first epoch goes too far", _updated(12, 6, target_kl=1e-4), **_STEPS, visible=True),
+        _case("steps, where nothing does", _updated(10, 4), **_STEPS),
+    ),
+    misconceptions=(
+        Misconception(
+            "gradient-never-cleared",
+            _updating(clear=lambda policy: None),
+            "backward() adds to the gradient that is there: set policy.weights.grad to None before it.",
+        ),
+        Misconception(
+            "gradient-not-clipped",
+            _updating(longest=lambda settings: INF),
+            "The gradient's norm is not clipped: hand settings.max_grad_norm to optimizer.step.",
+        ),
+        Misconception(
+            "one-epoch-only",
+            _updating(epochs=lambda settings: 1),
+            "The batch is used once: settings.num_epochs says how often.",
+        ),
+        Misconception(
+            "whole-batch-at-once",
+            _updating(parts=lambda batch, settings, generator: [batch]),
+            "There is one step in each epoch: make one for each minibatch.",
+        ),
+        Misconception(
+            "first-minibatch-only",
+            _updating(parts=lambda *given: _minibatches_of(*given)[:1]),
+            "Each epoch ends after its first minibatch: a return or break is one level too deep.",
+        ),
+        Misconception(
+            "old-log-probs-recomputed",
+            _updating(old=lambda rows, log_probs: log_probs.detach()),
+            "The old log-probabilities are those of the policy that acted, batch.old_log_probs, in every epoch.",
+        ),
+        Misconception(
+            "advantages-normalised-again",
+            _updating(weights=_normalised_rows),
+            "The advantages are normalised here, although they are to be taken as given: whoever made the batch has decided.",
+        ),
+        Misconception(
+            "clip-range-fixed",
+            _updating(coefficients=lambda settings: (0.2, settings.vf_coef, settings.ent_coef)),
+            "The clip range is 0.2 whatever the settings say.",
+        ),
+        Misconception(
+            "coefficients-swapped",
+            _updating(coefficients=lambda settings: (settings.clip_range, settings.ent_coef, settings.vf_coef)),
+            "vf_coef and ent_coef are the wrong way round in the call of ppo_loss.",
+        ),
+        Misconception(
+            "target-kl-ignored",
+            _updating(stop_at="never"),
+            "The update goes on although the KL divergence has passed settings.target_kl: stop after that epoch.",
+        ),
+        Misconception(
+            "stops-in-the-midst",
+            _updating(stop_at="minibatch"),
+            "The update stops in the midst of an epoch: a single minibatch's KL is noisy, compare the epoch's mean.",
+        ),
+        Misconception(
+            "metrics-of-the-last-minibatch",
+            _updating(summary=lambda history: history[-1]),
+            "The metrics are those of the last minibatch: average over all.",
+        ),
+        Misconception(
+            "metrics-summed",
+            _updating(summary=lambda history: {name: metric * len(history) for name, metric in _averaged(history).items()}),
+            "The metrics are added up: they then depend on the number of minibatches. Average.",
+        ),
+        Misconception(
+            "copy-trained",
+            _updating(trained=copy.deepcopy),
+            "The policy that was handed in has not changed: a copy was trained. Change policy itself, in place.",
+        ),
+    ),
+    variants={
+        "the gradient on paper": _after(
+            ch45.fast_ppo_update, lambda metrics: {name: metric.float() for name, metric in metrics.items()}
+        ),
+        "running sums": _running_sums,
+        "torch.autograd.grad": _by_autograd,
+        "zeros in place of None": _updating(
+            clear=lambda policy: None if policy.weights.grad is None else policy.weights.grad.zero_()
+        ),
+    },
+)
+
+# ----------------------------------------------------------------------------------------------- repaired_rollout (bug lab)
+
+
+def _overwritten(stack_at_the_end):
+    """The suspect program, and its cousin that stores references and stacks them at the end: both keep the environment's own array."""
+
+    def version(envs, policy, num_steps, obs, generator):
+        rows, kept = [], []
+        for _ in range(num_steps):
+            before = torch.as_tensor(obs, dtype=torch.float32)
+            actions = policy.act(before, generator)
+            obs, rewards, terminated, truncated, info = envs.step(_bounded(envs, actions))
+            rows.append((actions, torch.as_tensor(rewards), torch.as_tensor(true_next_obs(obs, info)), terminated, truncated))
+            kept.append(before if stack_at_the_end else before.clone())
+        columns = [torch.as_tensor(np.stack(column)) for column in zip(*rows, strict=True)]
+        return Rollout(torch.stack(kept), *columns, torch.as_tensor(obs).clone())
+
+    return version
+
+
+def _shifted(rollout):
+    """obs made of the successors of the row before: right, but for the row after an end."""
+    return Rollout(**vars(rollout) | {"obs": torch.cat([rollout.obs[:1], rollout.next_obs[:-1]])})
+
+
+def _rolled_actions(rollout):
+    """The suspect's pairs mended from the other side: each observation with the action of the row after it."""
+    successors = torch.cat([rollout.obs[1:], rollout.last_obs[None]])
+    return Rollout(**vars(rollout) | {"obs": successors, "actions": rollout.actions.roll(-1, dims=0)})
+
+
+def _blind(envs, policy, num_steps, obs, generator):
+    """The copy is made once, before the loop: the policy never sees anything else."""
+    first = torch.as_tensor(obs, dtype=torch.float32).clone()
+    return _rollout(act=lambda policy, obs, generator: policy.act(first, generator))(envs, policy, num_steps, obs, generator)
+
+
+REPAIRED_ROLLOUT = Exercise(
+    name="repaired_rollout",
+    reference=ch45.repaired_rollout,
+    criteria={"values": 1.0},
+    axes=("t", "env"),
+    cases=(
+        _case("drones that share an array", _collecting("HoverVectorEnv", 9, num_envs=4, copy=False), visible=True, draws=2),
+        _case("with time limits", _collecting("HoverVectorEnv", 12, num_envs=4, time_limit=5, copy=False), visible=True),
+        _case(
+            "drones that fly away", _collecting("HoverVectorEnv", 12, steps=6, action=1.0, num_envs=3, copy=False), visible=True
+        ),
+        _case("copies all the same", _collecting("HoverVectorEnv", 6, num_envs=4, time_limit=4), visible=True),
+        _case("an end at the last step", _collecting("HoverVectorEnv", 8, num_envs=2, time_limit=4, copy=False)),
+        _case("bounds and both ends", _collecting("TimerVectorEnv", 7, log_std=1.0, **_PAYING)),
+    ),
+    misconceptions=(
+        Misconception(
+            "the-suspects-own",
+            _overwritten(stack_at_the_end=False),
+            "This is the suspect's record. Compare obs[t] with next_obs[t], row by row. What does the array in `obs` hold after the step?",
+        ),
+        Misconception(
+            "all-rows-alike",
+            _overwritten(stack_at_the_end=True),
+            "All rows of obs are the last one: a list of references to one array. Copy before the next step, not at the end.",
+        ),
+        Misconception(
+            "shifted-by-hand",
+            _rollout(finish=_shifted),
+            "obs is made of next_obs of the row before. After an end that is the last state of the old episode, not the first of the new.",
+        ),
+        Misconception(
+            "actions-shifted-instead",
+            _rollout(finish=_rolled_actions),
+            "The actions were moved by a row so that they match the wrong observations: rewards and ends still belong to the rows before.",
+        ),
+        Misconception(
+            "copied-once",
+            _blind,
+            "The copy is made before the loop, and the policy acts on it at every step: copy each new observation.",
+        ),
+        *(
+            mistake
+            for mistake in _COLLECT_MISTAKES
+            if mistake.name
+            in ("next-obs-after-reset", "truncated-as-terminated", "clipped-actions-recorded", "mean-action", "restarted")
+        ),
+    ),
+    variants={
+        "memory made beforehand, filled before the step": _into_memory,
+        "columns of arrays": _columns_of_arrays,
+        "the rollout of exercise 3 with a clone": _rollout(),
+        "what the environment returns is copied at once": lambda envs, policy, num_steps, obs, generator: _columns_of_arrays(
+            envs, policy, num_steps, np.array(obs), generator
+        ),
+    },
+)
+
+
+EXERCISES = (GAUSSIAN_LOG_PROB, GAUSSIAN_ENTROPY, COLLECT_ROLLOUT, MINIBATCHES, PPO_LOSS, PPO_UPDATE, REPAIRED_ROLLOUT)
