@@ -40,8 +40,8 @@ def _changed(inputs, **changes):
 
 
 def _case(name, inputs, **options):
-    """A case of which one hidden draw is enough, since others ask for the same."""
-    return Case(name, inputs, **({"draws": 1} | options))
+    """A case that is either visible or hidden, unless `draws` says otherwise: what it asks for is asked for in others, too."""
+    return Case(name, inputs, **({"draws": 0 if options.get("visible") else 1} | options))
 
 
 # ---------------------------------------------------------------------------------------------- wrong answers, in general
@@ -142,14 +142,14 @@ GAUSSIAN_LOG_PROB = Exercise(
     criteria={"values": 0.65, "gradient": 0.15, "dtype": 0.05, "inputs": 0.05, "errors": 0.1},
     axes=("sample",),
     cases=(
-        _case("log_std of shape (A,)", _actions(), closed_form=_density_by_hand, visible=True, draws=2),
+        _case("log_std of shape (A,)", _actions(), closed_form=_density_by_hand, visible=True, draws=1),
         _case("log_std of shape (B, A)", _actions(per_sample=True), closed_form=_density_by_hand, visible=True),
         _case("actions at the mean", _at_the_mean, closed_form=_mode_density, visible=True),
         _case("a single action dimension", _actions(dims=1), closed_form=_density_by_hand, visible=True),
         _case("as many samples as dimensions", _actions(size=4, dims=4), closed_form=_density_by_hand),
         _case("twenty dimensions, far from the mean", _actions(dims=20, spread=12.0), closed_form=_density_by_hand, visible=True),
         _case("a very wide policy", _actions(base=4.0), closed_form=_density_by_hand),
-        _case("mean and log_std require gradient", _actions(), differentiate=("mean", "log_std"), visible=True),
+        _case("mean and log_std require gradient", _actions(), differentiate=("mean", "log_std"), visible=True, draws=1),
         _case("log_std (B, A) requires gradient", _actions(per_sample=True), differentiate=("mean", "log_std")),
         _case("single precision", _actions(), dtype=torch.float32, visible=True),
         _case(
@@ -844,7 +844,7 @@ PPO_LOSS = Exercise(
     reference=ch45.ppo_loss,
     criteria={"values": 1.2, "gradient": 0.5, "dtype": 0.05, "inputs": 0.05, "errors": 0.2},
     cases=(
-        _case("a minibatch", _update(), closed_form=_loss_by_hand, visible=True, draws=2),
+        _case("a minibatch", _update(), closed_form=_loss_by_hand, visible=True, draws=1),
         _case("one entropy for all", _update(shared_entropy=True), closed_form=_loss_by_hand, visible=True),
         _case("before the first step, perfect critic", _before_the_first_step, closed_form=_read_off, visible=True),
         _case("other coefficients", _update(vf_coef=1.7, ent_coef=0.3), closed_form=_loss_by_hand, visible=True),
@@ -853,7 +853,7 @@ PPO_LOSS = Exercise(
         _case("clip_range = 0.05", _update(clip_range=0.05), closed_form=_loss_by_hand, visible=True),
         _case("clip_range = infinity", _update(clip_range=INF, spread=1.0), closed_form=_loss_by_hand),
         _case("very unlikely actions", _update(base=-900.0), closed_form=_loss_by_hand, visible=True),
-        _case("all inputs require gradient", _update(), differentiate=(*_COLUMNS, "entropy"), visible=True),
+        _case("all inputs require gradient", _update(), differentiate=(*_COLUMNS, "entropy"), visible=True, draws=1),
         _case(
             "gradient with one entropy for all",
             _update(shared_entropy=True, vf_coef=1.7, ent_coef=0.3),
@@ -1195,13 +1195,15 @@ COLLECT_ROLLOUT = Exercise(
     criteria={"values": 1.9, "inputs": 0.1},
     axes=("t", "env"),
     cases=(
-        _case("episodes of 3, 5 and 2 steps", _collecting("TimerVectorEnv", 7, **_LENGTHS), visible=True),
-        _case("actions that pay", _collecting("TimerVectorEnv", 4, log_std=1.0, **_PAYING), visible=True),
-        _case("a rollout that goes on", _collecting("TimerVectorEnv", 8, steps=1, **_PAYING), visible=True),
-        _case("an end at the last step", _collecting("TimerVectorEnv", 6, **_LENGTHS), visible=True),
-        _case("the drone", _collecting("HoverVectorEnv", 9, num_envs=4, time_limit=5), visible=True),
+        _case(
+            "episodes of 3, 5 and 2 steps",
+            _collecting("TimerVectorEnv", 7, log_std=1.0, steps=1, **_PAYING),
+            visible=True,
+            draws=1,
+        ),
+        _case("an end at the last step", _collecting("TimerVectorEnv", 6, **_PAYING), visible=True),
+        _case("drones with a time limit", _collecting("HoverVectorEnv", 8, num_envs=4, time_limit=5), visible=True),
         _case("drones that fly away", _collecting("HoverVectorEnv", 12, steps=6, action=1.0, num_envs=3)),
-        _case("a single step", _collecting("HoverVectorEnv", 1, num_envs=2)),
     ),
     misconceptions=(
         *_COLLECT_MISTAKES,
@@ -1533,14 +1535,15 @@ REPAIRED_ROLLOUT = Exercise(
     criteria={"values": 1.0},
     axes=("t", "env"),
     cases=(
-        _case("drones that share an array", _collecting("HoverVectorEnv", 9, num_envs=4, copy=False), visible=True, draws=2),
-        _case("with time limits", _collecting("HoverVectorEnv", 12, num_envs=4, time_limit=5, copy=False), visible=True),
         _case(
-            "drones that fly away", _collecting("HoverVectorEnv", 12, steps=6, action=1.0, num_envs=3, copy=False), visible=True
+            "drones that share an array",
+            _collecting("HoverVectorEnv", 8, num_envs=4, time_limit=5, copy=False),
+            visible=True,
+            draws=1,
         ),
-        _case("copies all the same", _collecting("HoverVectorEnv", 6, num_envs=4, time_limit=4), visible=True),
-        _case("an end at the last step", _collecting("HoverVectorEnv", 8, num_envs=2, time_limit=4, copy=False)),
-        _case("bounds and both ends", _collecting("TimerVectorEnv", 7, log_std=1.0, **_PAYING)),
+        _case("drones that don't", _collecting("HoverVectorEnv", 8, num_envs=2, time_limit=4), visible=True),
+        _case("drones that fly away", _collecting("HoverVectorEnv", 12, steps=6, action=1.0, num_envs=3, copy=False)),
+        _case("rewards, bounds and both ends", _collecting("TimerVectorEnv", 7, log_std=1.0, **_PAYING), visible=True),
     ),
     misconceptions=(
         Misconception(
