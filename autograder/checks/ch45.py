@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch.distributions import Independent, Normal
 
-from autograder.spec import Case, Exercise, Misconception
+from autograder.spec import Artefact, Case, Exercise, Misconception
 from course_lib import envs as environments
 from course_lib.cases import built
 from course_lib.rollouts import Rollout, true_next_obs
@@ -1589,4 +1589,14 @@ REPAIRED_ROLLOUT = Exercise(
 )
 
 
-EXERCISES = (GAUSSIAN_LOG_PROB, GAUSSIAN_ENTROPY, COLLECT_ROLLOUT, MINIBATCHES, PPO_LOSS, PPO_UPDATE, REPAIRED_ROLLOUT)
+TRAIN_PPO = Artefact(
+    name="train_ppo",
+    reference=ch45.train_ppo,
+    file="lander_policy.safetensors",
+    task="lander",
+    points=3.0,
+    thresholds=(0.0, 200.0),
+    experiment="lander",
+)
+
+EXERCISES = (GAUSSIAN_LOG_PROB, GAUSSIAN_ENTROPY, COLLECT_ROLLOUT, MINIBATCHES, PPO_LOSS, PPO_UPDATE, TRAIN_PPO, REPAIRED_ROLLOUT)
