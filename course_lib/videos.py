@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-CRF = range(26, 45, 3)  # x264's quality, from good to poor
+CRF = range(20, 45, 3)  # x264's quality, from good to poor
 
 
 def film(act, env, seed=0, max_steps=1000, fps=25):

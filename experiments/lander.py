@@ -23,7 +23,7 @@ import torch
 
 from course_lib import envs, videos
 from course_lib.policies import ActorCritic, load_policy, policy_for, save_policy
-from course_lib.ppo import PPOSettings
+from course_lib.ppo import LANDER_SETTINGS, PPOSettings
 from experiments.runner import Report, Result
 from solutions import ch44, ch45
 
@@ -31,10 +31,7 @@ ENVIRONMENT, NUM_ENVS = "LunarLanderContinuous-v3", 16
 EPISODES, EVALUATION_SEED, FILMED_SEED = 100, 1_000_000, 7
 INFINITE = float("inf")
 
-OURS = PPOSettings(
-    total_steps=400_000, num_steps=256, minibatch_size=512, num_epochs=10, learning_rate=1e-3, anneal=True, gamma=0.999, gae_lambda=0.98,
-    ent_coef=0.0, reward_scale=0.05, log_std=-0.5,
-)  # fmt: skip
+OURS = LANDER_SETTINGS
 SETTINGS: dict[str, PPOSettings] = {
     "ours": OURS,
     "no_clip": OURS.but(clip_range=INFINITE),
