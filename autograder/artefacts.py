@@ -52,9 +52,11 @@ def _frozen(artefact: Artefact, purpose: str, episodes: int) -> FrozenArtefact:
 
 
 def hand_in(exercises: Iterable[Exercise | Artefact], folder: Path) -> None:
-    """Put the reference's own files where a notebook's would lie. Raises FileNotFoundError if one has not been made."""
+    """Put the reference's own files where a notebook's would lie. Raises ValueError if one has not been made."""
     for exercise in exercises:
         if isinstance(exercise, Artefact):
+            if not answer(exercise).is_file():
+                raise ValueError(f"{answer(exercise)} is missing: the file that the reference of {exercise.name} made")
             shutil.copyfile(answer(exercise), folder / exercise.file)
 
 

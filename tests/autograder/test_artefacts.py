@@ -131,6 +131,7 @@ def test_a_files_points_do_not_depend_on_the_graders_environment(folder, monkeyp
 
 
 def test_the_notebook_says_what_the_points_are_for_and_has_the_locked_check():
+    assemble.verify(PAGE, SOURCES)
     notebook = assemble.student_view(PAGE, sources=SOURCES)
     text = "\n".join(cell.source for cell in notebook.cells)
     assert "**4 points:** for the file `lander_policy.safetensors`, handed in beside the notebook." in text
@@ -226,7 +227,7 @@ def test_the_book_runs_a_chapter_with_the_references_own_file(folder, monkeypatc
     monkeypatch.setattr(artefacts, "ROOT", folder)
     target = folder / "page"
     target.mkdir()
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(ValueError, match=r"lander_policy\.safetensors is missing: the file that the reference of train made"):
         artefacts.hand_in(course.EXERCISES["ch97"], target)
     (folder / "solutions").mkdir()
     artefacts.answer(course.TRAIN).write_bytes(course.policy())
