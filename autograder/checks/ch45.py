@@ -1595,7 +1595,7 @@ TRAIN_PPO = Artefact(
     file="lander_policy.safetensors",
     task="lander",
     points=3.0,
-    thresholds=(0.0, 200.0),
+    thresholds=(0.0, 180.0),
     experiment="lander",
 )
 
