@@ -40,8 +40,11 @@ STAGE = BOOK / "_stage"
 PUBLISHED = ("*.html", "searchindex.js", "_static/*", "_images/*", "_downloads/*")
 HOW_TO = ("how-to/learners", "how-to/teachers", "how-to/contributors")
 MATHJAX = ("tex-chtml-full.js", "output/chtml/fonts/**/*", "a11y/*", "sre/**/*")
-# The library's modules that decide a kill matrix: it takes minutes, so a new plot must not ask for it again.
-JUDGING = ("cases", "diagnosis", "runner", "validate")
+# The library's modules that no kill matrix depends on: it takes minutes, so a new plot must not ask for it again.
+WITHOUT_A_SAY = (
+    "artefact", "chapters", "check", "checking", "command", "flight", "interactive", "notebook", "plotting", "records", "statistics",
+    "videos",
+)  # fmt: skip
 
 __all__ = ["BookError", "build", "executed_outputs"]
 
@@ -180,7 +183,7 @@ def kill_rows(chapter: Chapter) -> list[dict]:
     """The chapter's kill matrix, a dict for each exercise, computed on all cores once for each state of what takes part."""
     from autograder import checks  # loads torch, as does all that judges
 
-    library = [COURSE_LIB / f"{module}.py" for module in JUDGING]
+    library = [path for path in COURSE_LIB.glob("*.py") if path.stem not in WITHOUT_A_SAY]
     own = [path for path in code_inputs(chapter) if not {COURSE_LIB, RUNS} & set(path.parents)]
     cached = (
         cache_folder() / f"{chapter.assignment}-{content_hash([], [*library, *own, ROOT / 'autograder' / 'killmatrix.py'])}.json"
