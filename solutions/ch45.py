@@ -308,8 +308,8 @@ def repaired_rollout(envs, policy, num_steps, obs, generator):
         obs, rewards, terminated, truncated, info = envs.step(actions.numpy().clip(bounds.low, bounds.high))
         steps.append((before, actions, rewards, true_next_obs(obs, info), terminated, truncated))
     columns = [torch.as_tensor(np.stack(column)) for column in zip(*steps, strict=True)]
-    columns = [column.float() if column.is_floating_point() else column for column in columns]
-    return Rollout(*columns, torch.as_tensor(obs, dtype=torch.float32).clone())
+    columns.append(torch.as_tensor(obs).clone())
+    return Rollout(*(column.float() if column.is_floating_point() else column for column in columns))
 
 
 def fast_ppo_update(policy, optimizer, batch, settings, generator):

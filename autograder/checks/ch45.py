@@ -732,6 +732,10 @@ def _share_outside(log_ratio, clip_range):
     return (log_ratio.expm1().abs() > clip_range).to(log_ratio.dtype).mean()
 
 
+def _detached(found, _vf_coef, _ent_coef):
+    return {name: value.detach() for name, value in found.items()}
+
+
 def _parts(
     policy=_clipped,
     critic=_squared,
@@ -740,7 +744,7 @@ def _parts(
     outside=_share_outside,
     total=lambda policy, critic, bonus, vf_coef, ent_coef: policy + vf_coef * critic - ent_coef * bonus,
     log_ratio=lambda new, old: new - old.detach(),
-    metrics=lambda found, vf_coef, ent_coef: {name: value.detach() for name, value in found.items()},
+    metrics=_detached,
     leaks=(),
     checked=True,
 ):
@@ -1097,7 +1101,8 @@ def _rollout(
             rows.append(recorded(row))
         final = torch.as_tensor(last(obs, rows[-1]), dtype=torch.float32).clone()
         names = ("obs", "actions", "rewards", "next_obs", "terminated", "truncated")
-        return finish(Rollout(*(torch.stack([row[name] for row in rows]) for name in names), final))
+        columns = {name: torch.stack([row[name] for row in rows]) for name in names}
+        return finish(Rollout(**columns, last_obs=final))
 
     return version
 
@@ -1115,12 +1120,14 @@ def _restarted(envs, _obs):
     return envs.reset(seed=0)[0]
 
 
-def _turned(rollout):
-    return Rollout(*(column.transpose(0, 1) for column in list(vars(rollout).values())[:-1]), rollout.last_obs)
+def _columnwise(change):
+    """A change of all columns of a rollout but last_obs."""
 
+    def changed(rollout):
+        columns = {name: change(column) for name, column in vars(rollout).items() if name != "last_obs"}
+        return Rollout(**columns, last_obs=rollout.last_obs)
 
-def _flattened(rollout):
-    return Rollout(*(column.flatten(0, 1) for column in list(vars(rollout).values())[:-1]), rollout.last_obs)
+    return changed
 
 
 def _own_generator(policy, obs, _generator):
@@ -1185,8 +1192,16 @@ _COLLECT_MISTAKES = (
         _rollout(extra_steps=1),
         "There is a step too many: a rollout has num_steps rows.",
     ),
-    Misconception("axes-swapped", _rollout(finish=_turned), "Rollouts are time-major: (T, N), not (N, T)."),
-    Misconception("flattened", _rollout(finish=_flattened), "The rows of all environments are in one axis; GAE needs (T, N)."),
+    Misconception(
+        "axes-swapped",
+        _rollout(finish=_columnwise(lambda column: column.transpose(0, 1))),
+        "Rollouts are time-major: (T, N), not (N, T).",
+    ),
+    Misconception(
+        "flattened",
+        _rollout(finish=_columnwise(lambda column: column.flatten(0, 1))),
+        "The rows of all environments are in one axis; GAE needs (T, N).",
+    ),
 )
 
 COLLECT_ROLLOUT = Exercise(
@@ -1246,7 +1261,7 @@ def _into_memory(envs, policy, num_steps, obs, generator):
 def _columns_of_arrays(envs, policy, num_steps, obs, generator):
     """A variant: lists of arrays, made tensors at the end."""
     low, high = envs.single_action_space.low, envs.single_action_space.high
-    columns = {name: [] for name in ("obs", "actions", "rewards", "next_obs", "terminated", "truncated")}
+    columns: dict[str, list] = {name: [] for name in ("obs", "actions", "rewards", "next_obs", "terminated", "truncated")}
     for _ in range(num_steps):
         columns["obs"].append(np.array(obs, np.float32))
         with torch.no_grad():
@@ -1352,7 +1367,8 @@ def _normalised_rows(rows):
 
 def _running_sums(policy, optimizer, batch, settings, generator):
     """A variant: slices of a permutation, sums in place of lists, the gradient set to zero after the step."""
-    sums, count, epoch, divergence = {}, 0, 0, 0.0
+    sums: dict[str, torch.Tensor] = {}
+    count, epoch, divergence = 0, 0, 0.0
     while epoch < settings.num_epochs and divergence <= settings.target_kl:
         order, start, divergence = torch.randperm(len(batch.obs), generator=generator), 0, 0.0
         while start < len(order):
@@ -1507,7 +1523,7 @@ def _overwritten(stack_at_the_end):
             rows.append((actions, torch.as_tensor(rewards), torch.as_tensor(true_next_obs(obs, info)), terminated, truncated))
             kept.append(before if stack_at_the_end else before.clone())
         columns = [torch.as_tensor(np.stack(column)) for column in zip(*rows, strict=True)]
-        return Rollout(torch.stack(kept), *columns, torch.as_tensor(obs).clone())
+        return Rollout(*[torch.stack(kept), *columns, torch.as_tensor(obs).clone()])
 
     return version
 
