@@ -67,7 +67,32 @@ def terminated_ignored():
 @mistake
 def sign_flipped():
     """The policy descends the objective."""
-    return [_with_batch(lambda batch, settings: replace(batch, advantages=-batch.advantages))]
+    return [_with_batch(lambda batch, *others: replace(batch, advantages=-batch.advantages))]
+
+
+@mistake
+def ratio_inverted():
+    """The ratio is that of the old policy to the new one."""
+
+    def gradient(log_probs, old_log_probs, *others):
+        metrics, d_log_ratio = correct(old_log_probs, log_probs, *others)
+        return metrics, -d_log_ratio
+
+    correct = ch45.clipped_surrogate_gradient
+    return [mock.patch.object(ch45, "clipped_surrogate_gradient", gradient)]
+
+
+@mistake
+def mean_action():
+    """The log-probabilities are those of the likeliest actions, not of the ones taken."""
+
+    def changed(batch, settings, policy):
+        actions = policy.best_action(batch.obs)
+        with torch.no_grad():
+            old_log_probs, _, _ = ch45.evaluate_actions(policy, batch.obs, actions)
+        return replace(batch, actions=actions, old_log_probs=old_log_probs)
+
+    return [_with_batch(changed)]
 
 
 @mistake
@@ -84,7 +109,7 @@ def returns_from_normalised():
 def misaligned():
     """Advantages are flattened environment by environment, everything else step by step."""
 
-    def changed(batch, settings):
+    def changed(batch, settings, policy):
         return replace(batch, advantages=batch.advantages.view(settings.num_steps, -1).T.flatten())
 
     return [_with_batch(changed)]
@@ -107,7 +132,7 @@ def _with_batch(change):
 
     def changed(policy, rollout, settings, reward=None):
         batch, explained = estimate(policy, rollout, settings, reward)
-        return change(batch, settings), explained
+        return change(batch, settings, policy), explained
 
     return mock.patch.object(ch45, "estimate", changed)
 

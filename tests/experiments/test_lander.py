@@ -2,6 +2,7 @@
 
 from contextlib import ExitStack
 
+import numpy as np
 import pytest
 import torch
 
@@ -49,6 +50,22 @@ def test_returns_are_made_of_normalised_advantages():
 def test_advantages_are_misaligned():
     ours, broken = learned_from("ours").advantages, learned_from("broken_misaligned").advantages
     assert torch.equal(broken, ours.view(8, 4).T.flatten()) and not torch.equal(broken, ours)
+
+
+def test_likeliest_actions_take_the_place_of_those_taken():
+    ours, broken = learned_from("ours"), learned_from("broken_mean_action")
+    assert torch.equal(broken.advantages, ours.advantages) and not torch.equal(broken.actions, ours.actions)
+    assert (broken.old_log_probs >= ours.old_log_probs).all()
+
+
+def test_an_inverted_ratio_turns_the_gradient_around():
+    log_probs = np.zeros(3, np.float32)
+    _, before = ch45.clipped_surrogate_gradient(log_probs, log_probs, np.ones(3, np.float32), 0.2)
+    with ExitStack() as patches:
+        for patch in lander.MISTAKES["broken_ratio_inverted"]():
+            patches.enter_context(patch)
+        _, inverted = ch45.clipped_surrogate_gradient(log_probs, log_probs, np.ones(3, np.float32), 0.2)
+    np.testing.assert_array_equal(inverted, -before)
 
 
 def test_a_recomputed_ratio_is_always_one():
