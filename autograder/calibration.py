@@ -1,7 +1,7 @@
 """Where the thresholds of an exercise that is judged by a file come from: agents trained rightly and wrongly, and how they flew.
 
 The bar: of right agents, at most one in a hundred earns less than all points; of those with a mistake that a flight must show
-(`Artefact.wrong`), at most one in a hundred earns half of them. Other mistakes let an agent land all the same: only the checks of
+(`Artefact.wrong`), none earns half of them, and of further ones at most one in twenty, which is as much as five agents can show. Other mistakes let an agent land all the same: only the checks of
 functions find those, and the table says how often they land. A student's luck is the seed of a training, since the judge's
 episodes are the same for all; the recorded ones begin from other seeds. Twenty agents cannot show a hundredth by counting, so the
 chance that a further agent crosses a mark is taken to be the larger of two estimates:
@@ -24,7 +24,7 @@ import numpy as np
 from autograder.spec import Artefact
 from course_lib import records
 
-BAR = 0.01
+BAR, BAR_WRONG = 0.01, 0.05
 DRAWS = 200_000
 
 

@@ -1613,6 +1613,7 @@ TRAIN_PPO = Artefact(
     points=3.0,
     thresholds=(0.0, 180.0),
     experiment="lander",
+    wrong=("broken_sign_flipped", "broken_misaligned", "broken_ratio_inverted", "broken_mean_action"),
 )
 
 EXERCISES = (GAUSSIAN_LOG_PROB, GAUSSIAN_ENTROPY, COLLECT_ROLLOUT, MINIBATCHES, PPO_LOSS, PPO_UPDATE, TRAIN_PPO, REPAIRED_ROLLOUT)
