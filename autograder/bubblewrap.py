@@ -22,7 +22,16 @@ APART = ("--unshare-net", "--unshare-ipc", "--unshare-uts", "--hostname", "sandb
 LIBRARY_CACHE = ("--ro-bind-try", "/etc/ld.so.cache", "/etc/ld.so.cache")
 
 # What a learner may import, beside course_lib. Their requirements come with them; nothing else that is installed does.
-LEARNER_PACKAGES = ("torch", "numpy", "matplotlib", "ipywidgets", "gymnasium[box2d,mujoco]", "safetensors", "tqdm")
+LEARNER_PACKAGES = (
+    "torch",
+    "numpy",
+    "matplotlib",
+    "ipywidgets",
+    "gymnasium[box2d,mujoco]",
+    "safetensors",
+    "threadpoolctl",
+    "tqdm",
+)
 
 ENVIRONMENT = {
     "HOME": "/work", "MPLBACKEND": "Agg", "MPLCONFIGDIR": "/tmp", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1",

@@ -26,7 +26,17 @@ from autograder.chapter import ANSWER_LINE, Chapter
 from autograder.contract import STUB, Sources
 from autograder.contract import sources as real_sources
 
-LEARNERS_NEED = {"torch", "numpy", "matplotlib", "ipywidgets", "gymnasium[box2d]", "safetensors", "pyarrow", "tqdm"}
+LEARNERS_NEED = {
+    "torch",
+    "numpy",
+    "matplotlib",
+    "ipywidgets",
+    "gymnasium[box2d]",
+    "safetensors",
+    "pyarrow",
+    "threadpoolctl",
+    "tqdm",
+}
 RECORDED = {".parquet", ".mp4", ".webp"}  # not policies: one could be handed in
 MANIFEST = ".release.json"
 

@@ -18,6 +18,9 @@ import numpy as np
 import safetensors
 import safetensors.torch
 import torch
+from threadpoolctl import threadpool_limits
+
+threadpool_limits(1, user_api="blas")  # NumPy's products of small matrices, which torch.set_num_threads does not reach
 
 LAYERS = ("0", "1", "out")
 LANDER = {"obs_dim": 8, "action_dim": 2, "discrete": False, "hidden": 64}
