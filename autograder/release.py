@@ -26,7 +26,18 @@ from autograder.chapter import ANSWER_LINE, Chapter
 from autograder.contract import STUB, Sources
 from autograder.contract import sources as real_sources
 
-LEARNERS_NEED = {"torch", "numpy", "matplotlib", "ipywidgets", "gymnasium", "safetensors", "tqdm"}
+LEARNERS_NEED = {
+    "torch",
+    "numpy",
+    "matplotlib",
+    "ipywidgets",
+    "gymnasium",
+    "safetensors",
+    "tqdm",
+    "pyarrow",
+    "transformers",
+    "vaderSentiment",
+}
 MANIFEST = ".release.json"
 
 Recorded = Callable[[Chapter], assemble.Outputs | None]
