@@ -100,13 +100,17 @@ class LanguageModel(torch.nn.Module):
         kept = mask & (input_ids != self.end_id)
         return self.tokenizer.batch_decode([row[keep].tolist() for row, keep in zip(input_ids, kept, strict=True)])
 
+    def hidden(self, input_ids: torch.Tensor, attention_mask: torch.Tensor) -> torch.Tensor:
+        """What the last layer knows at every position; (B, L, D). What it is at padding means nothing."""
+        return self.network.base_model(**_inputs(input_ids, attention_mask)).last_hidden_state
+
+    def head(self, hidden: torch.Tensor) -> torch.Tensor:
+        """Logits of the next token, (..., V), from what the last layer knows, (..., D)."""
+        return self.network.get_output_embeddings()(hidden)
+
     def logits(self, input_ids: torch.Tensor, attention_mask: torch.Tensor) -> torch.Tensor:
         """Logits of the next token at every position, (B, L, V); what they are at padding means nothing."""
-        return self.network(**_inputs(input_ids, attention_mask)).logits
-
-    def hidden(self, input_ids: torch.Tensor, attention_mask: torch.Tensor) -> torch.Tensor:
-        """What the last layer knows at every position, from which the logits are computed; (B, L, D)."""
-        return self.network.base_model(**_inputs(input_ids, attention_mask)).last_hidden_state
+        return self.head(self.hidden(input_ids, attention_mask))
 
     @torch.no_grad()
     def generate(
