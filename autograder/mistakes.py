@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -70,6 +71,11 @@ def refused(inputs: Inputs, visible: bool = False, **impossible: Any) -> Case:
     """A setting that must be refused."""
     ((name, value),) = impossible.items()
     return Case(f"{name} = {value}", replaced(inputs, **impossible), raises=[name], visible=visible, draws=1)
+
+
+def drawn_once(*cases: Case) -> tuple[Case, ...]:
+    """Cases that do not say otherwise are drawn once for the judge: with many cases each fault shows in several of them."""
+    return tuple(replace(case, draws=1) if case.draws == Case.draws else case for case in cases)
 
 
 def after(function: Callable, change: Callable) -> Callable:

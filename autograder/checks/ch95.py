@@ -12,6 +12,7 @@ from autograder.mistakes import (
     SHAPES,
     after,
     cut_from_graph,
+    drawn_once,
     dtype_lost,
     in_place,
     integers,
@@ -97,7 +98,7 @@ PER_TOKEN_LOGPS = Exercise(
     reference=ch95.per_token_logps,
     criteria={"values": 1.0, "gradient": 0.2, "dtype": 0.1, "inputs": 0.1, "errors": 0.1},
     axes=("text", "t"),
-    cases=(
+    cases=drawn_once(
         Case("three texts of six tokens", _logits(), closed_form=_token_by_token, visible=True, draws=3),
         Case(
             "all tokens equally likely: -log V",
@@ -502,7 +503,7 @@ KL_PENALIZED_REWARDS = Exercise(
     reference=ch95.kl_penalized_rewards,
     criteria={"values": 1.2, "gradient": 0.15, "dtype": 0.1, "inputs": 0.1, "errors": 0.2},
     axes=("text", "t"),
-    cases=(
+    cases=drawn_once(
         Case("completions in the middle of their rows", _penalised(), closed_form=_penalised_by_loop, visible=True, draws=3),
         Case("completions at the end of their rows", _penalised(shape="right"), closed_form=_penalised_by_loop, visible=True),
         Case("completions that begin in the first column", _penalised(shape="left"), closed_form=_penalised_by_loop),
@@ -677,7 +678,7 @@ MASKED_MEAN = Exercise(
     name="masked_mean",
     reference=ch95.masked_mean,
     criteria={"values": 0.7, "dtype": 0.1, "inputs": 0.1, "errors": 0.1},
-    cases=(
+    cases=drawn_once(
         Case("rows of very different lengths", _entries(), closed_form=_mean_by_list, visible=True, draws=3),
         Case("scattered entries and an empty row", _scattered, closed_form=_mean_by_list, visible=True),
         Case("everything kept", _whole, closed_form=_mean_by_list),
@@ -797,7 +798,7 @@ MASKED_WHITEN = Exercise(
     also_right=(_unbiased, _eps_outside),
     criteria={"values": 0.95, "dtype": 0.1, "inputs": 0.1, "errors": 0.1},
     axes=("text", "t"),
-    cases=(
+    cases=drawn_once(
         Case("rows of very different lengths", _entries(), closed_form=_whiten_by_list, visible=True, draws=3),
         Case("scattered entries and an empty row", _scattered, closed_form=_whiten_by_list, visible=True),
         Case("everything kept", _whole, closed_form=_whiten_by_list),
@@ -1007,7 +1008,7 @@ MASKED_GAE = Exercise(
     criteria={"values": 1.35, "gradient": 0.2, "dtype": 0.1, "inputs": 0.1, "errors": 0.25},
     axes=("text", "t"),
     last_step_first=True,
-    cases=(
+    cases=drawn_once(
         Case("completions in the middle of their rows", _tokens(), closed_form=_gae_by_sums, visible=True, draws=3),
         Case("completions at the end of their rows", _tokens(shape="right"), closed_form=_gae_by_sums, visible=True),
         Case("completions that begin in the first column", _tokens(shape="left"), closed_form=_gae_by_sums),
@@ -1219,7 +1220,7 @@ PPO_TOKEN_LOSS = Exercise(
     name="ppo_token_loss",
     reference=ch95.ppo_token_loss,
     criteria={"values": 1.2, "gradient": 0.4, "dtype": 0.1, "inputs": 0.1, "errors": 0.2},
-    cases=(
+    cases=drawn_once(
         Case("rows of very different lengths", _EPOCH, closed_form=_loss_by_tokens, visible=True, draws=3),
         Case("clip_range = 0.05", _epoch(clip_range=0.05), closed_form=_loss_by_tokens, visible=True),
         Case("clip_range = 0", _epoch(clip_range=0.0), closed_form=_loss_by_tokens),

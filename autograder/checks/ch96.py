@@ -13,6 +13,7 @@ from autograder.mistakes import (
     SHAPES,
     after,
     cut_from_graph,
+    drawn_once,
     dtype_lost,
     in_place,
     integers,
@@ -106,7 +107,7 @@ LAST_TOKEN_SCORES = Exercise(
     reference=ch96.last_token_scores,
     criteria={"values": 1.0, "gradient": 0.2, "dtype": 0.1, "inputs": 0.1, "errors": 0.1},
     axes=("text",),
-    cases=(
+    cases=drawn_once(
         Case("padding on the right", _padded("right"), closed_form=_by_reading_backwards, visible=True, draws=3),
         Case("padding on the left", _padded("left"), closed_form=_by_reading_backwards, visible=True, draws=3),
         Case("padding on both sides", _padded("both"), closed_form=_by_reading_backwards),
@@ -285,7 +286,7 @@ REWARD_MODEL_LOSS = Exercise(
     name="reward_model_loss",
     reference=ch96.reward_model_loss,
     criteria={"values": 1.35, "gradient": 0.6, "dtype": 0.1, "inputs": 0.1, "errors": 0.35},
-    cases=(
+    cases=drawn_once(
         Case("nine comparisons", _PLAIN, closed_form=_loss_by_formula, visible=True, draws=3),
         Case("with margins", _comparisons(), closed_form=_loss_by_formula, visible=True, draws=3),
         Case("margin=None, said aloud", replaced(_PLAIN, margin=None), closed_form=_loss_by_formula),
@@ -497,9 +498,12 @@ def _n(low, high):
     return lambda generator: {"n": int(integers(generator, low, high))}
 
 
+QUADRATURE = np.polynomial.legendre.leggauss(200)
+
+
 def _kl_by_integral(n):
     """KL of the best of n: the best one's rank among all texts has density n u^(n-1), so the KL is ∫ n u^(n-1) log(n u^(n-1)) du."""
-    nodes, weights = np.polynomial.legendre.leggauss(200)
+    nodes, weights = QUADRATURE
     t = (nodes + 1) / 2  # with u = t^(1/n), the density of t is 1 and the logarithm's argument n t^((n-1)/n)
     return float((weights / 2 * (math.log(n) + (n - 1) / n * np.log(t))).sum())
 
@@ -639,7 +643,7 @@ LENGTH_CORRELATION = Exercise(
     name="length_correlation",
     reference=ch96.length_correlation,
     criteria={"values": 0.7, "gradient": 0.1, "dtype": 0.1, "inputs": 0.05, "errors": 0.05},
-    cases=(
+    cases=drawn_once(
         Case("longer is better", _lengths(1.0), closed_form=_by_numpy, visible=True, draws=3),
         Case("shorter is better", _lengths(-1.0), closed_form=_by_numpy, visible=True),
         Case("nothing to see", _lengths(0.0), closed_form=_by_numpy),

@@ -12,6 +12,7 @@ from autograder.mistakes import (
     SHAPES,
     after,
     cut_from_graph,
+    drawn_once,
     dtype_lost,
     in_place,
     integers,
@@ -135,7 +136,7 @@ SEQUENCE_LOGPS = Exercise(
     reference=ch97.sequence_logps,
     criteria={"values": 1.25, "gradient": 0.25, "dtype": 0.15, "inputs": 0.1, "errors": 0.25},
     axes=("text",),
-    cases=(
+    cases=drawn_once(
         Case("prompts, completions, padding", _texts, closed_form=_by_token, visible=True, draws=3),
         Case("one token kept in each row", _one_token_each, closed_form=_by_token, visible=True),
         Case("all tokens equally likely: -log V for each", _even_odds, closed_form=_log_of_even_odds, visible=True),
@@ -391,7 +392,7 @@ DPO_LOSS = Exercise(
     reference=ch97.dpo_loss,
     criteria={"values": 1.6, "gradient": 0.75, "dtype": 0.15, "inputs": 0.1, "errors": 0.4},
     axes=("pair",),
-    cases=(
+    cases=drawn_once(
         Case("nine pairs, default beta", _pairs(), closed_form=_dpo_by_formula, visible=True, draws=3),
         Case(
             "beta = 0.5, label_smoothing = 0.2", _pairs(beta=0.5, label_smoothing=0.2), closed_form=_dpo_by_formula, visible=True
@@ -604,7 +605,7 @@ IPO_LOSS = Exercise(
     reference=ch97.ipo_loss,
     criteria={"values": 1.0, "gradient": 0.3, "dtype": 0.1, "inputs": 0.1, "errors": 0.25},
     axes=("pair",),
-    cases=(
+    cases=drawn_once(
         Case("nine pairs, default beta", _pairs(), closed_form=_ipo_by_formula, visible=True, draws=3),
         Case("beta = 0.5", _pairs(beta=0.5), closed_form=_ipo_by_formula, visible=True),
         Case("beta = 2", _pairs(beta=2), closed_form=_ipo_by_formula),
@@ -774,7 +775,7 @@ KL_OPTIMAL_POLICY = Exercise(
     reference=ch97.kl_optimal_policy,
     criteria={"values": 1.1, "dtype": 0.1, "inputs": 0.1, "errors": 0.2},
     axes=("prompt", "answer"),
-    cases=(
+    cases=drawn_once(
         Case("five answers", _answers(5), closed_form=_tilted, visible=True, draws=3),
         Case("four prompts", _answers(4, 6, beta=0.3), closed_form=_tilted, visible=True),
         Case("more axes", _answers(2, 3, 4, beta=2.0), closed_form=_tilted),
