@@ -1,0 +1,103 @@
+"""Reference solutions of chapter 96: reward models from comparisons, and best-of-n beside them."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch.nn import functional
+
+from course_lib import validate
+
+
+def last_token_scores(values, attention_mask):
+    """The reward model's verdict on each text: its number at the last token that is no padding.
+
+    Only there has a causal model read the whole text.
+
+    Args:
+      values: a number for each token; (B, L). Receives gradient.
+      attention_mask: True (or 1) at tokens, False (or 0) at padding, which may be on
+        either side; at least one token in each row; (B, L) bool or int64.
+
+    Returns: (B,) scores.
+    Raises: ValueError if the shapes differ.
+    """
+    validate.same_shape(values=values, attention_mask=attention_mask)
+    columns = torch.arange(values.shape[1], device=values.device)
+    last = torch.where(attention_mask.bool(), columns, -1).argmax(1)  # (B,)
+    return values.gather(1, last[:, None]).squeeze(1)
+
+
+def reward_model_loss(chosen_scores, rejected_scores, margin=None):
+    """Negative log-likelihood of the comparisons under the Bradley-Terry model.
+
+        L = -mean(log σ(chosen - rejected - margin))
+
+    Ouyang et al. (2022), eq. 1; with a margin: Touvron et al. (2023), eq. 2.
+
+    Args:
+      chosen_scores: of the texts that were preferred; (B,). Receives gradient.
+      rejected_scores: of the others; (B,). Receives gradient.
+      margin: by how much the chosen score should be higher, at least; (B,) or None for
+        no margin. No gradient.
+
+    Returns: scalar (0-dim) tensor, finite for any finite scores.
+    Raises: ValueError if the shapes differ.
+    """
+    validate.same_shape(chosen_scores=chosen_scores, rejected_scores=rejected_scores)
+    gaps = chosen_scores - rejected_scores
+    if margin is not None:
+        validate.same_shape(chosen_scores=chosen_scores, margin=margin)
+        gaps = gaps - margin.detach()
+    return -functional.logsigmoid(gaps).mean()
+
+
+def best_of_n(scores):
+    """Of n candidates for each prompt, the one with the highest score.
+
+    Args:
+      scores: of n completions of each of B prompts; (B, n).
+
+    Returns: (B,) int64, indices of the best ones.
+    """
+    return scores.argmax(-1)
+
+
+def best_of_n_kl(n):
+    """How far best-of-n moves from the policy that it samples: KL(best of n ‖ policy).
+
+        log n - (n - 1) / n
+
+    Exact where no two candidates have one score, an upper bound otherwise.
+    Beirami et al. (2024), https://arxiv.org/abs/2401.01879
+
+    Args:
+      n: number of candidates, at least 1.
+
+    Returns: float, in nats.
+    Raises: ValueError if n < 1.
+    """
+    if n < 1:
+        raise ValueError(f"n must be at least 1, got {n}")
+    return math.log(n) - (n - 1) / n
+
+
+def length_correlation(scores, lengths):
+    """Pearson's correlation between the scores of texts and their lengths.
+
+        Σ (s - s̄)(l - l̄) / sqrt(Σ (s - s̄)² Σ (l - l̄)²)
+
+    A reward model that has learnt "longer is better" shows it here.
+
+    Args:
+      scores: of B texts, not all equal; (B,).
+      lengths: of the same texts, in tokens, not all equal; (B,) int64 or floating point.
+
+    Returns: scalar (0-dim) tensor in [-1, 1], in the dtype of scores, without a graph.
+    Raises: ValueError if the shapes differ.
+    """
+    validate.same_shape(scores=scores, lengths=lengths)
+    a = scores.detach() - scores.detach().mean()
+    b = lengths.to(scores.dtype) - lengths.to(scores.dtype).mean()
+    return (a * b).sum() / (a.square().sum() * b.square().sum()).sqrt()
