@@ -39,3 +39,15 @@ def non_negative(**scalars: float) -> None:
     for name, value in scalars.items():
         if not value >= 0:
             raise ValueError(f"{name} must be at least 0, got {value}")
+
+
+def positive(**scalars: float) -> None:
+    """Raise ValueError unless every scalar is greater than 0.
+
+    >>> positive(temperature=0)
+    Traceback (most recent call last):
+    ValueError: temperature must be greater than 0, got 0
+    """
+    for name, value in scalars.items():
+        if not value > 0:
+            raise ValueError(f"{name} must be greater than 0, got {value}")
