@@ -355,7 +355,9 @@ PREFERENCE_PROBABILITY = Exercise(
         Misconception("difference-only", _pair(lambda a, b: a - b), "This is the log-odds: the probability is its sigmoid."),
         Misconception("log-probability", _pair(lambda a, b: F.logsigmoid(a - b)), "This is the logarithm of the probability."),
         Misconception(
-            "second-return-ignored", _pair(lambda a, b: torch.sigmoid(a)), "A return says nothing alone: compare it with the other."
+            "second-return-ignored",
+            _pair(lambda a, b: torch.sigmoid(a)),
+            "A return says nothing alone: compare it with the other.",
         ),
         Misconception(
             "tanh-instead-of-sigmoid",
@@ -452,14 +454,15 @@ BRADLEY_TERRY_LOSS = Exercise(
     reference=ch80.bradley_terry_loss,
     criteria={"values": 1.5, "gradient": 1.0, "dtype": 0.1, "inputs": 0.1, "errors": 0.3},
     cases=(
-        Case("a batch of choices", _choices(), closed_form=_loss_by_hand, visible=True, draws=3),
+        Case("a batch of choices", _choices(), closed_form=_loss_by_hand, visible=True),
         Case(
             "a model that sees no difference: log 2",
             _choice_gaps(0.0, 0.0, 0.0),
             closed_form=lambda chosen_returns, rejected_returns: torch.tensor(math.log(2), dtype=torch.float64),
             visible=True,
+            draws=1,
         ),
-        Case("one choice, against the model", _choice_gaps(-2.0), closed_form=_loss_by_hand, visible=True),
+        Case("one choice, against the model", _choice_gaps(-2.0), closed_form=_loss_by_hand, visible=True, draws=1),
         Case(
             "a gap of +1000: nothing to learn",
             _choice_gaps(1000.0),
@@ -474,14 +477,14 @@ BRADLEY_TERRY_LOSS = Exercise(
             visible=True,
             draws=1,
         ),
-        Case("gaps of ±30", _choice_gaps(30.0, -30.0, 30.0), closed_form=_loss_by_hand),
-        Case("large returns, small gaps", _choices(level=2000.0), closed_form=_loss_by_hand, visible=True),
-        Case("both inputs require gradient", _choices(), differentiate=_CHOICE, visible=True),
+        Case("gaps of ±30", _choice_gaps(30.0, -30.0, 30.0), closed_form=_loss_by_hand, draws=1),
+        Case("large returns, small gaps", _choices(level=2000.0), closed_form=_loss_by_hand, visible=True, draws=1),
+        Case("both inputs require gradient", _choices(), differentiate=_CHOICE, visible=True, draws=1),
         Case("gradient at a gap of exactly 0", _choice_gaps(0.0, 0.0, 0.0), differentiate=_CHOICE, visible=True, draws=1),
         Case("gradient at a gap of -1000", _choice_gaps(-1000.0, 1.0), differentiate=_CHOICE, visible=True, draws=1),
         Case("gradient at a gap of +1000", _choice_gaps(1000.0, 1.0), differentiate=_CHOICE, draws=1),
-        Case("single precision", _choices(), dtype=torch.float32, visible=True),
-        Case("single precision, gaps of ±1000 and 0", _choice_gaps(1000.0, -1000.0, 0.0), dtype=torch.float32),
+        Case("single precision", _choices(), dtype=torch.float32, visible=True, draws=1),
+        Case("single precision, gaps of ±1000 and 0", _choice_gaps(1000.0, -1000.0, 0.0), dtype=torch.float32, draws=1),
         *_shape_cases(_CHOICE, _choices()),
     ),
     misconceptions=(
@@ -562,7 +565,9 @@ BRADLEY_TERRY_LOSS = Exercise(
             "Independent choices multiply: take each pair's logarithm, then the mean.",
         ),
         Misconception(
-            "base-two", _loss_of_gap(lambda x: -F.logsigmoid(x).mean() / math.log(2)), "This is in bits: use the natural logarithm."
+            "base-two",
+            _loss_of_gap(lambda x: -F.logsigmoid(x).mean() / math.log(2)),
+            "This is in bits: use the natural logarithm.",
         ),
         Misconception(
             "rejected-detached",
@@ -685,9 +690,7 @@ PREFERENCE_ACCURACY = Exercise(
         "sign of the gap": _choice_variant(lambda c, r: (c - r).detach().sign().clamp(min=0).mean()),
         "one minus the mistakes": _choice_variant(lambda c, r: 1 - torch.le(c, r).to(c.dtype).mean()),
         "count_nonzero": _choice_variant(lambda c, r: torch.count_nonzero(c > r).to(c.dtype) / c.numel()),
-        "NumPy": _choice_variant(
-            lambda c, r: torch.tensor(np.mean(c.detach().numpy() > r.detach().numpy()), dtype=c.dtype)
-        ),
+        "NumPy": _choice_variant(lambda c, r: torch.tensor(np.mean(c.detach().numpy() > r.detach().numpy()), dtype=c.dtype)),
     },
 )
 
@@ -738,7 +741,10 @@ def _standardised_in_python(r, m, eps):
     kept = [x for x, keep in zip(r.flatten().tolist(), m.flatten().tolist(), strict=True) if keep]
     mean = sum(kept) / len(kept)
     deviation = math.sqrt(sum((x - mean) ** 2 for x in kept) / (len(kept) - 1))
-    out = [(x - mean) / (deviation + eps) if keep else 0.0 for x, keep in zip(r.flatten().tolist(), m.flatten().tolist(), strict=True)]
+    out = [
+        (x - mean) / (deviation + eps) if keep else 0.0
+        for x, keep in zip(r.flatten().tolist(), m.flatten().tolist(), strict=True)
+    ]
     return torch.tensor(out, dtype=r.dtype).reshape(r.shape)
 
 
