@@ -10,6 +10,7 @@ import torch.nn.functional as F
 
 from autograder.spec import Case, Exercise, Misconception
 from course_lib import validate
+from course_lib.cases import built
 from solutions import ch80
 
 # ------------------------------------------------------------------------------------------------------- inputs
@@ -77,10 +78,6 @@ def _gaps(*gaps, first="returns_a", second="returns_b"):
         return {first: returns + torch.tensor(gaps, dtype=torch.float64), second: returns}
 
     return inputs
-
-
-def _chosen(inputs, **settings):
-    return inputs(**settings) if settings else inputs
 
 
 def _choices(**settings):
@@ -765,15 +762,9 @@ def _standardised_in_place(r, m, eps):
     return result
 
 
-def _biased(deviation_with_eps):
-    """The other right answers: the biased deviation, epsilon inside the root."""
-
-    def right(rewards, mask, eps=1e-8):
-        validate.same_shape(rewards=rewards, mask=mask)
-        kept = rewards[mask]
-        return ((rewards - kept.mean()) / deviation_with_eps(kept, eps)).masked_fill(~mask, 0)
-
-    return right
+def _biased(r, m, eps):
+    """The other right answer: the biased deviation."""
+    return _scaled(r, m, r[m].mean(), r[m].std(unbiased=False), eps)
 
 
 def _all_equal_zero(rewards, mask):
@@ -783,7 +774,7 @@ def _all_equal_zero(rewards, mask):
 STANDARDIZE_REWARDS = Exercise(
     name="standardize_rewards",
     reference=ch80.standardize_rewards,
-    also_right=(_biased(lambda kept, eps: kept.std(unbiased=False) + eps),),
+    also_right=(_standardised(_biased),),
     criteria={"values": 0.75, "dtype": 0.05, "inputs": 0.1, "errors": 0.1},
     axes=("segment", "t"),
     cases=(
@@ -877,10 +868,347 @@ STANDARDIZE_REWARDS = Exercise(
     },
 )
 
+# ------------------------------------------------------------------------------------------ simulate_preferences
+
+_ANSWERS = ("true_returns_a", "true_returns_b")
+_PER_GROUP = 8000
+_SPREAD = 0.05
+"""More than six standard deviations of the difference between two frequencies of _PER_GROUP answers each."""
+
+
+def _groups(*gaps, temperature=1.0, level=0.0):
+    """Many pairs for each of these gaps, so that frequencies can be told apart."""
+
+    def inputs(generator):
+        returns = level + torch.randint(-4, 5, (len(gaps),), generator=generator).double()
+        ahead = returns + torch.tensor(gaps, dtype=torch.float64)
+        seed = int(torch.randint(2**31, (), generator=generator))
+        return {
+            "true_returns_a": ahead.repeat_interleave(_PER_GROUP),
+            "true_returns_b": returns.repeat_interleave(_PER_GROUP),
+            "temperature": temperature,
+            "generator": built("seeding.generator", seed=seed),
+        }
+
+    return inputs
+
+
+def _few(**changes):
+    """A handful of pairs, which are enough for errors and for answers that are certain."""
+
+    def inputs(generator):
+        drawn = {name: 3 * _normal(generator, 5) for name in _ANSWERS}
+        return drawn | {"temperature": 1.0, "generator": built("seeding.generator", seed=1)} | changes
+
+    return inputs
+
+
+def _certain(generator):
+    """Gaps so large, for their temperature, that nobody errs."""
+    return _few(
+        true_returns_a=torch.tensor([1000.0, -1000.0, 3.0, 2.0, -60.0], dtype=torch.float64),
+        true_returns_b=torch.tensor([-1000.0, 1000.0, 2.0, 3.0, 60.0], dtype=torch.float64),
+        temperature=0.01,
+    )(generator)
+
+
+def _answers(formula, checked=True):
+    """A version of the simulated person; `formula` takes a, b, temperature and generator."""
+
+    def version(true_returns_a, true_returns_b, temperature, generator):
+        if checked:
+            validate.same_shape(true_returns_a=true_returns_a, true_returns_b=true_returns_b)
+            validate.positive(temperature=temperature)
+        return formula(true_returns_a, true_returns_b, temperature, generator)
+
+    return version
+
+
+def _answers_variant(formula):
+    def variant(true_returns_a, true_returns_b, temperature, generator):
+        _refuse(true_returns_a=true_returns_a, true_returns_b=true_returns_b)
+        if temperature <= 0:
+            raise ValueError(f"expected temperature > 0, but received {temperature!r}")
+        return formula(true_returns_a, true_returns_b, temperature, generator)
+
+    return variant
+
+
+def _uniform(x, generator):
+    return torch.rand(x.shape, generator=generator, dtype=x.dtype)
+
+
+def _with_probability(probability):
+    return lambda a, b, t, g: _uniform(a, g) < probability(a, b, t)
+
+
+def _gumbel(x, generator):
+    return -torch.empty_like(x).exponential_(generator=generator).log()
+
+
+def _by_numpy(a, b, t, g):
+    rng = np.random.default_rng(int(torch.randint(2**62, (), generator=g)))
+    with np.errstate(over="ignore"):
+        probability = 1 / (1 + np.exp((b - a).double().numpy() / t))
+    return torch.from_numpy(rng.random(len(a)) < probability)
+
+
+def _answers_in_place(a, b, t, g):
+    result = ch80.simulate_preferences(a, b, t, g)
+    a.sub_(b)
+    return result
+
+
+def _five_certain(true_returns_a, true_returns_b, temperature, generator):
+    return torch.tensor([True, False, True, False, False])
+
+
+_FREQUENCIES = {"view": "group_frequencies", "atol": _SPREAD}
+
+SIMULATE_PREFERENCES = Exercise(
+    name="simulate_preferences",
+    reference=ch80.simulate_preferences,
+    criteria={"values": 1.2, "dtype": 0.05, "inputs": 0.05, "errors": 0.2},
+    axes=("group",),
+    cases=(
+        Case("8000 answers to each of five gaps", _groups(-2.0, -0.7, 0.0, 0.7, 2.0), **_FREQUENCIES, visible=True),
+        Case("temperature 5", _groups(-5.0, 2.0, 5.0, temperature=5.0), **_FREQUENCIES, visible=True, draws=1),
+        Case("temperature 0.25", _groups(-0.25, 0.1, 0.25, temperature=0.25), **_FREQUENCIES, draws=1),
+        Case("returns around 1000", _groups(-1.0, 0.0, 1.0, level=1000.0), **_FREQUENCIES, visible=True, draws=1),
+        Case("asked twice", _groups(0.0, 1.0), repeat=2, **_FREQUENCIES, visible=True, draws=1),
+        Case("gaps that leave no doubt", _certain, closed_form=_five_certain, visible=True, draws=1),
+        Case("what is drawn from", _few(), returns=("generator",), view="drawn_from", visible=True, draws=1),
+        Case("single precision", _groups(-1.0, 1.0), **_FREQUENCIES, dtype=torch.float32, draws=1),
+        Case("temperature = 0", _few(temperature=0.0), raises=["temperature"], visible=True, draws=1),
+        Case("temperature = -1", _few(temperature=-1.0), raises=["temperature"], draws=1),
+        *_shape_cases(_ANSWERS, _few()),
+    ),
+    misconceptions=(
+        Misconception(
+            "temperature-ignored",
+            _answers(_with_probability(lambda a, b, t: torch.sigmoid(a - b))),
+            "The person is as sure as at temperature 1, whatever the argument says: divide the gap by the temperature.",
+        ),
+        Misconception(
+            "temperature-multiplied",
+            _answers(_with_probability(lambda a, b, t: torch.sigmoid((a - b) * t))),
+            "A hot person errs more, not less: divide the gap by the temperature.",
+        ),
+        Misconception(
+            "order-reversed",
+            _answers(_with_probability(lambda a, b, t: torch.sigmoid((b - a) / t))),
+            "True should mean that a is preferred, which is likelier the better a is.",
+        ),
+        Misconception(
+            "never-mistaken",
+            _answers(lambda a, b, t, g: (_uniform(a, g) < 2) & (a > b)),
+            "The better segment always wins here, as when the probability is rounded: compare it with a random number, one for each pair.",
+        ),
+        Misconception(
+            "mistakes-whatever-the-gap",
+            _answers(lambda a, b, t, g: (a > b) ^ (_uniform(a, g) < 0.1)),
+            "One answer in ten is flipped, however clear the case: mistakes must grow rare as the gap grows.",
+        ),
+        Misconception(
+            "one-draw-for-all",
+            _answers(lambda a, b, t, g: torch.rand((), generator=g, dtype=a.dtype) < torch.sigmoid((a - b) / t)),
+            "All pairs share one random number, so that equal gaps get equal answers: draw one for each pair.",
+        ),
+        Misconception(
+            "normal-noise",
+            _answers(lambda a, b, t, g: a - b + t * torch.randn(a.shape, generator=g, dtype=a.dtype) > 0),
+            "Normal noise on the gap gives Thurstone's model. The sigmoid is the distribution of logistic noise.",
+        ),
+        Misconception(
+            "uniform-noise",
+            _answers(lambda a, b, t, g: a - b + t * (2 * _uniform(a, g) - 1) > 0),
+            "Uniform noise on the gap gives probabilities on a straight line that ends at a gap of one temperature; the sigmoid "
+            "never ends.",
+        ),
+        Misconception(
+            "generator-ignored",
+            _answers(lambda a, b, t, g: torch.rand_like(a) < torch.sigmoid((a - b) / t)),
+            "The answers come from another source of randomness, so a seed does not fix them: pass generator=generator.",
+        ),
+        Misconception(
+            "seeded-inside",
+            _answers(lambda a, b, t, g: _uniform(a, torch.Generator().manual_seed(0)) < torch.sigmoid((a - b) / t)),
+            "A seed inside the function gives the same answers at every call: draw from the generator that is handed in.",
+        ),
+        Misconception(
+            "probabilities-returned",
+            _answers(lambda a, b, t, g: torch.sigmoid((a - b) / t) + 0 * _uniform(a, g)),
+            "These are the probabilities: draw the answers, as a bool tensor.",
+        ),
+        Misconception("returns-changed-in-place", _answers(_answers_in_place), _IN_PLACE),
+        Misconception(
+            "bad-input-accepted",
+            _answers(
+                lambda a, b, t, g: (
+                    _uniform(a, g) < torch.sigmoid((a - b[: None if len(b) == 1 else len(a)]) / t)
+                    if len(a) == len(b) or len(b) == 1
+                    else _uniform(b, g) < torch.sigmoid((a[: len(b)] - b) / t)
+                ),
+                checked=False,
+            ),
+            "A temperature of 0 or less, and shapes that differ, must be refused: course_lib.validate raises errors that name them.",
+        ),
+    ),
+    variants={
+        "torch.bernoulli": _answers_variant(lambda a, b, t, g: torch.bernoulli(torch.sigmoid((a - b) / t), generator=g).bool()),
+        "logistic noise on the gap": _answers_variant(lambda a, b, t, g: a - b + t * _uniform(a, g).logit(eps=1e-12) > 0),
+        "Gumbel noise on both returns": _answers_variant(lambda a, b, t, g: a / t + _gumbel(a, g) > b / t + _gumbel(b, g)),
+        "a drawn index": _answers_variant(
+            lambda a, b, t, g: torch.multinomial((torch.stack([a, b], 1) / t).softmax(1), 1, generator=g)[:, 0] == 0
+        ),
+        "NumPy, seeded from the generator": _answers_variant(_by_numpy),
+    },
+)
+
+# -------------------------------------------------------------------------------------- repaired_segment_returns
+
+_LAB = ("obs", "mask")
+
+
+def _clips(batch=6, steps=9, full=False, zeros=False, front=False):
+    """Observations of unequal clips, padded with zeros or with noise, and a reward model that is not 0 at zero."""
+
+    def inputs(generator):
+        drawn = _segments(batch, steps, full)(generator)
+        mask = drawn["mask"].flip(1) if front else drawn["mask"]
+        obs = _normal(generator, batch, steps, 3)
+        model = built(
+            "preferences.QuadraticReward",
+            linear=_normal(generator, 3),
+            quadratic=_normal(generator, 3),
+            bias=1 + torch.rand(1, generator=generator, dtype=torch.float64),
+        )
+        return {"reward_model": model, "obs": obs * mask.unsqueeze(-1) if zeros else obs, "mask": mask}
+
+    return inputs
+
+
+def _learned(formula, checked=True):
+    """A version of the repair; `formula` takes the model, obs and mask."""
+
+    def version(reward_model, obs, mask):
+        if checked and obs.shape[:-1] != mask.shape:
+            raise ValueError(f"obs and mask must agree, got obs {tuple(obs.shape)}, mask {tuple(mask.shape)}")
+        return formula(reward_model, obs, mask)
+
+    return version
+
+
+def _learned_step_by_step(model, obs, mask):
+    returns = []
+    for clip, kept in zip(obs, mask, strict=True):
+        returns.append(sum((model(clip[t]) for t in torch.nonzero(kept).flatten().tolist()), clip.new_zeros(())))
+    return torch.stack(returns)
+
+
+def _learned_kept_only(model, obs, mask):
+    """The model never sees the padding."""
+    rows, _ = torch.nonzero(mask, as_tuple=True)
+    return obs.new_zeros(len(obs)).index_add(0, rows, model(obs[mask]))
+
+
+def _learned_minus_padding(model, obs, mask):
+    """Zero the padding, and take off again what the model gives for zeros."""
+    zeroed = obs * mask.unsqueeze(-1)
+    return model(zeroed).sum(1) - (~mask).sum(1) * model(torch.zeros_like(obs[0, 0]))
+
+
+def _learned_in_place(model, obs, mask):
+    returns = ch80.repaired_segment_returns(model, obs, mask)
+    with torch.no_grad():
+        obs[~mask] = 0
+    return returns
+
+
+def _observation_reshaped(change):
+    return _reshaped("mask", change, _clips())
+
+
+REPAIRED_SEGMENT_RETURNS = Exercise(
+    name="repaired_segment_returns",
+    reference=ch80.repaired_segment_returns,
+    criteria={"values": 1.4, "gradient": 0.4, "dtype": 0.05, "inputs": 0.05, "errors": 0.1},
+    axes=("segment",),
+    cases=(
+        Case("clips of unequal length", _clips(), closed_form=_learned_step_by_step, visible=True, draws=3),
+        Case("padding of zeros", _clips(zeros=True), closed_form=_learned_step_by_step, visible=True),
+        Case("clips of full length", _clips(full=True), closed_form=_learned_step_by_step, visible=True),
+        Case("padding in front", _clips(front=True), closed_form=_learned_step_by_step),
+        Case("one clip", _clips(batch=1), closed_form=_learned_step_by_step),
+        Case("observations that require gradient", _clips(), differentiate=["obs"], visible=True),
+        Case("gradient with padding of zeros", _clips(zeros=True), differentiate=["obs"]),
+        Case("single precision", _clips(), dtype=torch.float32, visible=True),
+        Case("mask of one row", _observation_reshaped(lambda m: m[:1]), raises=_LAB, visible=True, draws=1),
+        Case("mask of one column", _observation_reshaped(lambda m: m[:, :1]), raises=_LAB, draws=1),
+    ),
+    misconceptions=(
+        Misconception(
+            "observations-masked",
+            _learned(lambda f, o, m: f(o * m.unsqueeze(-1)).sum(1)),
+            "This is the suspect program's own bug. What reward does a model with biases give for an observation of zeros, and "
+            "how often is that added up in a short clip?",
+        ),
+        Misconception(
+            "mask-ignored", _learned(lambda f, o, m: f(o).sum(1)), "The padding is scored and added as well: use the mask."
+        ),
+        Misconception(
+            "mask-inverted",
+            _learned(lambda f, o, m: (f(o) * ~m).sum(1)),
+            "This adds up the padding: True marks the steps to keep.",
+        ),
+        Misconception(
+            "mean-instead-of-sum",
+            _learned(lambda f, o, m: (f(o) * m).sum(1) / m.sum(1)),
+            "The length of a clip is forgotten, and it is what these comparisons are about: sum, do not average.",
+        ),
+        Misconception(
+            "mean-over-padded-length",
+            _learned(lambda f, o, m: (f(o) * m).mean(1)),
+            "Dividing by the padded length changes the unit of the returns: sum, do not average.",
+        ),
+        Misconception(
+            "observations-masked-and-averaged",
+            _learned(lambda f, o, m: f(o * m.unsqueeze(-1)).sum(1) / m.sum(1)),
+            "The padding still enters, as an observation of zeros, and the sum has become a mean: mask the rewards, then sum.",
+        ),
+        Misconception(
+            "model-of-the-sum",
+            _learned(lambda f, o, m: f((o * m.unsqueeze(-1)).sum(1))),
+            "The reward of a sum of observations is not the sum of their rewards: score each step first.",
+        ),
+        Misconception(
+            "rewards-per-step",
+            _learned(lambda f, o, m: f(o).masked_fill(~m, 0)),
+            "These are the rewards, (B, T), rightly masked: a clip's return is their sum.",
+        ),
+        *_spoilt(ch80.repaired_segment_returns),
+        Misconception("observations-changed-in-place", _learned(_learned_in_place), _IN_PLACE),
+        Misconception(
+            "bad-input-accepted",
+            _learned(lambda f, o, m: f(o).masked_fill(~m, 0).sum(1), checked=False),
+            "A mask of one row or column broadcasts silently over all clips: compare the shapes first.",
+        ),
+    ),
+    variants={
+        "product with the mask": _learned(lambda f, o, m: (f(o) * m).sum(-1)),
+        "step by step": _learned(_learned_step_by_step),
+        "the model never sees the padding": _learned(_learned_kept_only),
+        "padding's reward taken off again": _learned(_learned_minus_padding),
+        "einsum": _learned(lambda f, o, m: torch.einsum("bt,bt->b", f(o), m.to(o.dtype))),
+    },
+)
+
 EXERCISES = (
     SEGMENT_RETURNS,
     PREFERENCE_PROBABILITY,
+    SIMULATE_PREFERENCES,
     BRADLEY_TERRY_LOSS,
     PREFERENCE_ACCURACY,
     STANDARDIZE_REWARDS,
+    REPAIRED_SEGMENT_RETURNS,
 )
