@@ -67,7 +67,7 @@ def draw_pairs(num_segments, num_pairs, generator):
 
 
 class RewardModel(nn.Module):
-    """A network of two hidden layers (tanh) that gives each observation and action one number, in a unit of its own.
+    """A network of two hidden layers (ReLU) that gives each observation and action one number, in a unit of its own.
 
     Args:
       obs_dim: components of an observation.
@@ -82,7 +82,7 @@ class RewardModel(nn.Module):
             torch.manual_seed(seed)
             inputs = obs_dim + action_dim
             self.layers = nn.Sequential(
-                nn.Linear(inputs, hidden), nn.Tanh(), nn.Linear(hidden, hidden), nn.Tanh(), nn.Linear(hidden, 1)
+                nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 1)
             )
         self.action_dim = action_dim
         self.register_buffer("centre", torch.zeros(inputs))
@@ -120,7 +120,7 @@ class QuadraticReward:
         return obs @ self.linear + obs.square() @ self.quadratic + self.bias.squeeze()
 
 
-def fit(model, chosen, rejected, loss, steps=300, batch_size=64, learning_rate=2e-3, weight_decay=0.01, seed=0):
+def fit(model, chosen, rejected, loss, steps=300, batch_size=32, learning_rate=2e-3, weight_decay=0.01, seed=0):
     """Fit a reward model to comparisons, in place, with AdamW.
 
     Args:
