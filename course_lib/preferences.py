@@ -76,7 +76,7 @@ class RewardModel(nn.Module):
       seed: of the weights.
     """
 
-    def __init__(self, obs_dim, action_dim=0, hidden=64, seed=0):
+    def __init__(self, obs_dim, action_dim=0, hidden=32, seed=0):
         super().__init__()
         with torch.random.fork_rng():
             torch.manual_seed(seed)
@@ -85,14 +85,12 @@ class RewardModel(nn.Module):
                 nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 1)
             )
         self.action_dim = action_dim
-        self.register_buffer("centre", torch.zeros(inputs))
-        self.register_buffer("spread", torch.ones(inputs))
+        self.centre, self.spread = torch.zeros(inputs), torch.ones(inputs)
 
     def scale_to(self, segments) -> RewardModel:
         """Let inputs enter in units of their spread among these clips; returns the model itself."""
         inputs = self._inputs(segments.obs, segments.actions)[segments.mask]
-        self.centre.copy_(inputs.mean(0))
-        self.spread.copy_(inputs.std(0).clamp(min=1e-3))
+        self.centre, self.spread = inputs.mean(0), inputs.std(0).clamp(min=1e-3)
         return self
 
     def forward(self, obs, actions=None):

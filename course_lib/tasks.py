@@ -9,20 +9,29 @@ from gymnasium.vector.utils import batch_space
 
 
 class _VectorTask(gym.vector.VectorEnv):
-    """N environments without terminal states, truncated together after `time_limit` steps; same-step autoreset.
-
-    A task defines `start(count)`, new states (count, S); `observe(states)`, (N, O) float32; and `advance(states, actions)`, the next
-    states and the rewards.
-    """
+    """N environments without terminal states, truncated together after `time_limit` steps; same-step autoreset."""
 
     def __init__(self, num_envs, time_limit, observation_space, action_space):
         if time_limit < 1:
             raise ValueError(f"time_limit must be at least 1, got {time_limit}")
         self.num_envs, self.time_limit = num_envs, time_limit
         self.single_observation_space, self.single_action_space = observation_space, action_space
+        self.low, self.high = action_space.low[0], action_space.high[0]
         self.observation_space = batch_space(observation_space, num_envs)
         self.action_space = batch_space(action_space, num_envs)
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def start(self, count):
+        """New states, (count, S)."""
+        raise NotImplementedError
+
+    def observe(self, states):
+        """The observations (N, O) float32 of states (N, S)."""
+        raise NotImplementedError
+
+    def advance(self, states, actions):
+        """One step from states (N, S) with actions (N,): the next states and the rewards (N,)."""
+        raise NotImplementedError
 
     def reset(self, *, seed=None, options=None):
         """Start all episodes; `options={"states": array}` places them."""
@@ -33,8 +42,7 @@ class _VectorTask(gym.vector.VectorEnv):
 
     def step(self, actions):
         """Move every environment by one step; actions (N, 1)."""
-        bounds = self.single_action_space
-        pushes = np.clip(np.asarray(actions, dtype=float)[:, 0], bounds.low[0], bounds.high[0])
+        pushes = np.clip(np.asarray(actions, dtype=float)[:, 0], self.low, self.high)
         self.states, rewards = self.advance(self.states, pushes)
         self.elapsed += 1
         truncated = np.full(self.num_envs, self.elapsed == self.time_limit)

@@ -23,23 +23,24 @@ NOISE = {
 KL_COEFS = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0)
 
 VARIANTS: dict[str, dict] = {
+    **{f"cruise_{kl_coef:g}": {"task": "cruise", "comparisons": 100, "noise": 0.5, "kl_coef": kl_coef} for kl_coef in KL_COEFS},
+    "cruise_rounds": {"task": "cruise", "comparisons": 100, "noise": 0.5, "rounds": 5},
+    **{f"{task}_true": {"task": task, "comparisons": None} for task in ("cruise", "pendulum", "cartpole")},
     **{
         f"{task}_{count}_{noise}": {"task": task, "comparisons": count, "noise": NOISE[noise]}
-        for task in ("cartpole", "pendulum")
+        for task, noises in (("pendulum", ("sure", "unsure", "guessing")), ("cartpole", ("sure", "unsure")))
+        for noise in noises
         for count in COMPARISONS
-        for noise in (NOISE if count else ("sure",))
+        if count or noise == "sure"
     },
-    **{f"{task}_true": {"task": task, "comparisons": None} for task in ("cartpole", "pendulum", "cruise")},
-    **{f"cruise_{kl_coef:g}": {"task": "cruise", "comparisons": 100, "noise": 0.5, "kl_coef": kl_coef} for kl_coef in KL_COEFS},
-    "cartpole_rounds": {"task": "cartpole", "comparisons": 300, "noise": NOISE["sure"], "rounds": 5},
     "pendulum_rounds": {"task": "pendulum", "comparisons": 300, "noise": NOISE["unsure"], "rounds": 5},
-    "cruise_rounds": {"task": "cruise", "comparisons": 100, "noise": 0.5, "rounds": 5},
+    "cartpole_rounds": {"task": "cartpole", "comparisons": 300, "noise": NOISE["sure"], "rounds": 5},
 }
-SEEDS = {variant: 10 if variant.startswith("cruise") else 5 for variant in VARIANTS}
+SEEDS = 5
 
 SETTINGS = {
     "cartpole": PPOSettings(
-        total_steps=65_536,
+        total_steps=49_152,
         num_steps=128,
         minibatch_size=256,
         num_epochs=6,
@@ -48,7 +49,7 @@ SETTINGS = {
         gae_lambda=0.95,
     ),
     "pendulum": PPOSettings(
-        total_steps=128_000,
+        total_steps=96_000,
         num_steps=200,
         minibatch_size=320,
         num_epochs=8,
@@ -71,8 +72,8 @@ SETTINGS = {
 TRUE_SCALE = {"cartpole": 1.0, "pendulum": 0.1, "cruise": 1.0}  # what the true rewards are multiplied by when PPO sees them
 CLIP_LENGTH = {"cartpole": 50, "pendulum": 25, "cruise": 10}
 HORIZON = {"cartpole": 500, "pendulum": 200, "cruise": 50}  # steps of a whole episode
-POOL = 2000  # clips that all comparisons are drawn from
-HELD_OUT = 1000
+POOL = 1000  # clips that all comparisons are drawn from
+HELD_OUT = 500
 
 
 def make_envs(task, num_envs=32, time_limit=None):
