@@ -228,7 +228,7 @@ def _show_live(session: Session) -> None:
                 button.disabled = True
         with plot:
             plot.clear_output(wait=True)
-            figure, ax = plt.subplots(figsize=(6, 2.6))
+            _, ax = plt.subplots(figsize=(6, 2.6))
             _draw(ax, session)
             plt.show()
 
