@@ -82,8 +82,8 @@ class Session:
                 chosen.append(better)
                 rejected.append(worse)
         better, worse = torch.stack(chosen), torch.stack(rejected)
-        weights = torch.zeros(4, dtype=torch.float64, requires_grad=True)
-        optimizer = torch.optim.LBFGS([weights], max_iter=100, line_search_fn="strong_wolfe")
+        weights = self.weights.clone().requires_grad_()
+        optimizer = torch.optim.LBFGS([weights], max_iter=50, line_search_fn="strong_wolfe")
 
         def closure():
             optimizer.zero_grad()

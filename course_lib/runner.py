@@ -40,7 +40,7 @@ def observe(
         outputs would be, and the gradient of Σ_i cos(i) y_i over all output elements y is taken back to them.
       repeat: how often the function is called, with the same objects; what it returns is then a tuple of so many.
       returns: names of arguments whose contents after the calls are looked at in place of what the function returns; of a module, its
-        parameters and buffers.
+        parameters and buffers, of a generator its state.
 
     Returns: an Observation; an exception that the function raises is part of it, and is not raised again.
     """
@@ -91,9 +91,11 @@ def _given(value: Any) -> Any:
 
 
 def _taken_apart(value: Any) -> Any:
-    """The value with modules, data classes and iterators made dicts and tuples."""
+    """The value with modules, data classes and iterators made dicts and tuples, and a generator its state."""
     if isinstance(value, torch.nn.Module):
         return dict(value.state_dict())
+    if isinstance(value, torch.Generator):
+        return value.get_state()
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: _taken_apart(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, dict):

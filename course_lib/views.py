@@ -12,9 +12,65 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import torch
 
 READABLE = "result"
 """The kind of every observation that a view could read."""
+
+
+def epochs(arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What all random orders have in common: outputs "epoch.batch" hold one batch of indices each.
+
+    Args:
+      arguments: batch_size is the number of indices.
+      outputs: for each epoch its batches, (size,) integers each.
+
+    Returns: for each epoch the sizes of its batches, and truth values: whether an index is out of range, comes twice in the epoch, twice
+      in one batch, or is missing; whether the order is 0, 1, 2, …; whether every batch holds neighbours only; whether all epochs have
+      one order; whether the indices are int64.
+    """
+    batches: dict[int, list[np.ndarray]] = {}
+    for path, batch in outputs.items():
+        if path.count(".") != 1 or batch.ndim != 1 or batch.dtype.kind != "i":
+            raise ValueError("each batch must be a tensor of indices, (size,)")
+        batches.setdefault(int(path.split(".")[0]), []).append(batch)
+    if not batches:
+        raise ValueError("there are no batches")
+    orders = {epoch: np.concatenate(found) for epoch, found in batches.items()}
+    seen: dict[str, Any] = {}
+    for epoch, order in orders.items():
+        sizes = [len(batch) for batch in batches[epoch]]
+        seen |= {
+            f"{epoch}.sizes": sizes,
+            f"{epoch}.out_of_range": ((order < 0) | (order >= arguments["batch_size"])).any(),
+            f"{epoch}.twice": len(np.unique(order)) < len(order),
+            f"{epoch}.twice_in_a_batch": any(len(np.unique(batch)) < len(batch) for batch in batches[epoch]),
+            f"{epoch}.missing": len(np.setdiff1d(np.arange(arguments["batch_size"]), order)) > 0,
+            f"{epoch}.in_order": np.array_equal(order, np.arange(len(order))),
+            f"{epoch}.neighbours_only": all((np.diff(np.sort(batch)) == 1).all() for batch in batches[epoch]),
+        }
+    first = orders[min(orders)]
+    seen["one_order"] = len(orders) > 1 and all(np.array_equal(order, first) for order in orders.values())
+    seen["int64"] = all(batch.dtype == np.int64 for batch in outputs.values())
+    return {name: np.asarray(value) for name, value in seen.items()}
+
+
+def drawn_from(arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Whether anything was drawn from the generator whose state after the calls is the one output.
+
+    Args:
+      arguments: `generator` is built by seeding.generator.
+      outputs: "" is its state afterwards, bytes.
+    """
+    untouched = torch.Generator().manual_seed(arguments["generator"]["arguments"]["seed"]).get_state().numpy()
+    return {"drawn": np.asarray(not np.array_equal(outputs[""], untouched))}
+
+
+def steps_made(_arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """How many steps an optimiser has made, of all that it holds: what depends on a random order is left out."""
+    if "steps" not in outputs:
+        raise ValueError("there is no number of steps")
+    return {"steps": outputs["steps"]}
 
 
 def group_frequencies(arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

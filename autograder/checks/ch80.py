@@ -871,8 +871,8 @@ STANDARDIZE_REWARDS = Exercise(
 # ------------------------------------------------------------------------------------------ simulate_preferences
 
 _ANSWERS = ("true_returns_a", "true_returns_b")
-_PER_GROUP = 8000
-_SPREAD = 0.05
+_PER_GROUP = 5000
+_SPREAD = 0.06
 """More than six standard deviations of the difference between two frequencies of _PER_GROUP answers each."""
 
 
@@ -971,7 +971,7 @@ SIMULATE_PREFERENCES = Exercise(
     criteria={"values": 1.2, "dtype": 0.05, "inputs": 0.05, "errors": 0.2},
     axes=("group",),
     cases=(
-        Case("8000 answers to each of five gaps", _groups(-2.0, -0.7, 0.0, 0.7, 2.0), **_FREQUENCIES, visible=True),
+        Case("5000 answers to each of five gaps", _groups(-2.0, -0.7, 0.0, 0.7, 2.0), **_FREQUENCIES, visible=True),
         Case("temperature 5", _groups(-5.0, 2.0, 5.0, temperature=5.0), **_FREQUENCIES, visible=True, draws=1),
         Case("temperature 0.25", _groups(-0.25, 0.1, 0.25, temperature=0.25), **_FREQUENCIES, draws=1),
         Case("returns around 1000", _groups(-1.0, 0.0, 1.0, level=1000.0), **_FREQUENCIES, visible=True, draws=1),

@@ -1,0 +1,87 @@
+"""Views: what all right answers have in common, and what they make of anything else."""
+
+import numpy as np
+import pytest
+import torch
+
+from course_lib import views
+
+SIZES = {"batch_size": 6, "minibatch_size": 4, "generator": {"@built": "seeding.generator", "arguments": {"seed": 5}}}
+
+
+def seen(*orders, cuts=(4,)):
+    """The view of epochs with these orders, cut into batches."""
+    batches = [np.split(np.array(order, dtype=np.int64), cuts) for order in orders]
+    outputs = {f"{e}.{b}": batch for e, found in enumerate(batches) for b, batch in enumerate(found)}
+    return {name: value.tolist() for name, value in views.epochs(SIZES, outputs).items()}
+
+
+def test_two_permutations_look_alike():
+    first, second = seen([3, 1, 0, 5, 2, 4], [5, 0, 4, 1, 3, 2]), seen([2, 5, 1, 3, 0, 4], [4, 0, 2, 5, 1, 3])
+    assert first == second
+    assert first["0.sizes"] == [4, 2] and not first["0.twice"] and not first["0.missing"] and first["int64"]
+
+
+@pytest.mark.parametrize(
+    ("order", "flag"),
+    [
+        ([0, 1, 2, 3, 4, 5], "in_order"),
+        ([2, 0, 3, 1, 5, 4], "neighbours_only"),
+        ([3, 1, 0, 3, 2, 4], "twice_in_a_batch"),
+        ([3, 1, 0, 5, 3, 4], "twice"),
+        ([3, 1, 0, 5, 2, 3], "missing"),
+        ([3, 1, 0, 6, 2, 4], "out_of_range"),
+    ],
+)
+def test_what_is_no_random_order_is_told(order, flag):
+    assert seen(order)[f"0.{flag}"]
+
+
+def test_epochs_with_one_order_are_told():
+    assert seen([3, 1, 0, 5, 2, 4], [3, 1, 0, 5, 2, 4])["one_order"]
+    assert not seen([3, 1, 0, 5, 2, 4])["one_order"]  # of a single epoch one cannot know
+
+
+@pytest.mark.parametrize(
+    "outputs",
+    [{}, {"0": np.arange(6)}, {"0.0": np.arange(6.0)}, {"0.0": np.zeros((2, 3), int)}, {"0.0.0": np.array(1)}],
+)
+def test_what_is_no_epoch_is_refused(outputs):
+    with pytest.raises(ValueError):
+        views.epochs(SIZES, outputs)
+
+
+def test_whether_a_generator_was_drawn_from():
+    generator = torch.Generator().manual_seed(5)
+    assert not views.drawn_from(SIZES, {"": generator.get_state().numpy()})["drawn"]
+    torch.rand((), generator=generator)
+    assert views.drawn_from(SIZES, {"": generator.get_state().numpy()})["drawn"]
+
+
+def test_of_an_optimiser_its_steps():
+    assert views.steps_made({}, {"steps": np.array(3), "moments.0": np.ones(4)}) == {"steps": 3}
+    with pytest.raises(ValueError):
+        views.steps_made({}, {"moments.0": np.ones(4)})
+
+
+KINDS = {"true_returns_a": np.repeat([1.0, 2.0, 2.0], 4), "true_returns_b": np.repeat([0.0, 2.0, 1.0], 4)}
+
+
+def test_answers_are_counted_by_kind_of_pair():
+    answers = np.array([1, 1, 1, 1, 1, 0, 0, 1, 0, 0, 0, 1], dtype=bool)
+    once = views.group_frequencies(KINDS, {"": answers})
+    assert once["frequency"].tolist() == [1, 0.5, 0.25] and not once["alike"]
+    assert views.group_frequencies(KINDS, {"0": answers, "1": answers})["alike"]
+    twice = views.group_frequencies(KINDS, {"0": answers, "1": ~answers})
+    assert twice["frequency"].tolist() == [0.5, 0.5, 0.5] and not twice["alike"]
+
+
+@pytest.mark.parametrize("answers", [np.ones(12), np.ones(3, dtype=bool), np.ones((12, 1), dtype=bool)])
+def test_answers_that_are_no_bools_for_each_pair_cannot_be_read(answers):
+    with pytest.raises(ValueError, match="bool tensor of shape"):
+        views.group_frequencies(KINDS, {"": answers})
+
+
+def test_no_answers_cannot_be_read():
+    with pytest.raises(ValueError, match="bool tensor"):
+        views.group_frequencies(KINDS, {})
