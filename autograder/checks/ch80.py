@@ -873,7 +873,7 @@ STANDARDIZE_REWARDS = Exercise(
 _ANSWERS = ("true_returns_a", "true_returns_b")
 _PER_GROUP = 5000
 _SPREAD = 0.06
-"""More than six standard deviations of the difference between two frequencies of _PER_GROUP answers each."""
+"""Six standard deviations of the difference between two frequencies of _PER_GROUP answers each."""
 
 
 def _groups(*gaps, temperature=1.0, level=0.0):

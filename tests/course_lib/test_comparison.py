@@ -22,7 +22,7 @@ def test_a_session_learns_that_upright_is_good_from_a_person_who_never_errs():
     session = Session(loss, pairs=20)
     assert session.accuracy() == 0.5 and not session.curve().any()
     data = record(session, by_true_return)
-    assert data["accuracies"][-1] > 0.85
+    assert data["accuracies"][-1] > 0.8
     assert abs(data["angles"][int(np.argmax(data["curves"][-1]))]) < 60
 
 
