@@ -27,7 +27,7 @@
     make(svg, "circle", {cx: x, cy: y, r: 10, class: "bob"});
   });
   const drawCurve = (curve) => {
-    const width = Math.max(plot.parentElement.clientWidth, 260), height = 200, [left, right, top, bottom] = [40, 10, 10, 38];
+    const width = Math.max(plot.parentElement.clientWidth, 260), height = 200, [left, right, top, bottom] = [40, 20, 10, 38];
     const all = data.curves.flat(), high = Math.max(...all, 0.1) * 1.05, low = Math.min(...all, -0.1) * 1.05;
     const px = (v) => left + ((v + 180) / 360) * (width - left - right);
     const py = (v) => height - bottom - ((v - low) / (high - low)) * (height - top - bottom);
@@ -43,7 +43,7 @@
       make(plot, "line", {x1: left, x2: width - right, y1: py(v), y2: py(v), class: Math.abs(v) < 1e-9 ? "zero" : "grid"});
       make(plot, "text", {x: left - 5, y: py(v) + 4, "text-anchor": "end"}, String(Number(v.toFixed(2))));
     }
-    make(plot, "text", {x: (left + width - right) / 2, y: height - 4, "text-anchor": "middle"}, "angle from upright");
+    make(plot, "text", {x: (left + width - right) / 2, y: height - 4, "text-anchor": "middle"}, "angle from upright, positive to the left");
     make(plot, "polyline", {class: "learned", points: curve.map((v, i) => `${px(data.angles[i])},${py(v)}`).join(" ")});
     const best = data.angles[curve.indexOf(Math.max(...curve))];
     plot.setAttribute("aria-label", Math.max(...curve) - Math.min(...curve) < 1e-6
