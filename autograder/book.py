@@ -162,21 +162,26 @@ def _agents(row: dict) -> list[str]:
     """The part of the appendix on an exercise that is judged by a file."""
     low, high = row["thresholds"]
     table = [
-        f"| {_plain(group['mistake']) or 'trained rightly'} | {group['agents']} |"
+        f"| {_plain(group['mistake']) or 'trained rightly'} | {_must_fail(group, row)} | {group['agents']} |"
         f" {group['least']:.0f} | {group['middle']:.0f} | {group['most']:.0f} | {group['full']} | {group['half']} |"
         for group in row["agents"]
     ]
     return [
         f"### `{row['exercise']}`",
         "",
-        f"Points grow from none at a mean return of {low:g} to all at {high:g}. Mean returns in the grader's {row['episodes']} episodes,"
-        " of agents that differ in the seed of their training:",
+        f"Points grow from none at a mean return of {low:g} to all at {high:g}. Mean returns of {row['episodes']} recorded episodes, of"
+        " agents that differ in the seed of their training. Some mistakes let an agent land all the same: what a file does in flight"
+        " cannot show them, and the checks of the functions do.",
         "",
-        "| Agents | Number | Least | Middle | Most | With all points | With half of them or more |",
-        "|---|---|---|---|---|---|---|",
+        "| Agents | A flight must show it | Number | Least | Middle | Most | With all points | With half of them or more |",
+        "|---|---|---|---|---|---|---|---|",
         *table,
         "",
     ]
+
+
+def _must_fail(group: dict, row: dict) -> str:
+    return "" if not group["mistake"] else "yes" if group["variant"] in row["wrong"] else "no"
 
 
 def kill_rows(chapter: Chapter) -> list[dict]:
@@ -210,6 +215,7 @@ def _calibrations(chapter: Chapter) -> list[dict]:
             "exercise": artefact.name,
             "thresholds": artefact.thresholds,
             "episodes": artefact.episodes,
+            "wrong": list(artefact.wrong),
             "agents": [dataclasses.asdict(row) for row in calibration.rows(artefact, calibration.groups(artefact))],
         }
         for artefact in checks.exercises(chapter.assignment)

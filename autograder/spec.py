@@ -110,6 +110,7 @@ class Artefact:
     visible_episodes: int = 20
     experiment: str = ""  # whose agents show that the thresholds are right: autograder.calibration
     right: str = "ours"  # its variant that was trained rightly; those whose configuration names a `mistake` were not
+    wrong: Sequence[str] = ()  # of these, the ones that a flight must show
 
     @property
     def criteria(self) -> dict[str, float]:

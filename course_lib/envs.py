@@ -27,6 +27,14 @@ def make(name, num_envs, **env_kwargs):
     return gym.make_vec(name, num_envs, vectorization_mode="sync", vector_kwargs=options, **env_kwargs)
 
 
+def begun(envs, seed, steps=0, action=0.0):
+    """The environments after a reset with this seed and some steps in which every component of every action is `action`."""
+    envs.reset(seed=seed)
+    for _ in range(steps):
+        envs.step(np.full(envs.action_space.shape, action, np.float32))
+    return envs
+
+
 class TimerVectorEnv(gym.vector.VectorEnv):
     """Episodes of fixed lengths, and a reward of 1 a step: every value and advantage can be worked out by hand.
 
@@ -190,6 +198,74 @@ class ChainVectorEnv(gym.vector.VectorEnv):
         """The exact Q(s, a) = r(s, a) + γ Σ P(s' | s, a) V(s'): (length, 2) float64; arguments as for `values`."""
         transitions, rewards = self.model()
         return (rewards + gamma * transitions @ self.values(right_probability, gamma)).T
+
+
+class HoverVectorEnv(gym.vector.VectorEnv):
+    """A drone that should hover at height 0 and is shaken by gusts. Two numbers of state, one engine, no libraries.
+
+        v' = v + 0.2 (2 clip(a, -1, 1) + gust * w),   h' = h + 0.2 v',   reward exp(-2 h'²),   w ~ N(0, 1)
+
+    Episodes start at a height between -1.5 and 1.5, with a speed of standard deviation 0.5. Beyond a height of ±3 the drone is lost and
+    the episode is *terminated*; after `time_limit` steps it is *truncated*.
+
+    Gymnasium's vector interface with same-step autoreset, as for ChainVectorEnv.
+
+    Args:
+      num_envs: N drones, stepped together.
+      time_limit: steps to truncation, at least 1.
+      gust: standard deviation of the gusts, not negative.
+      copy: as for gymnasium.vector.SyncVectorEnv. If False, every call returns the one array in which the environment keeps its
+        observations, and the next step overwrites it: faster, where observations are large.
+
+    Observations: (N, 2) float32, height and speed. Actions: (N, 1), clipped to [-1, 1] by the environment.
+    Raises: ValueError if time_limit or gust is out of range.
+    """
+
+    def __init__(self, num_envs=16, time_limit=50, gust=0.3, copy=True):
+        if time_limit < 1:
+            raise ValueError(f"time_limit must be at least 1, got {time_limit}")
+        if gust < 0:
+            raise ValueError(f"gust must not be negative, got {gust}")
+        self.num_envs, self.time_limit, self.gust, self.copy = num_envs, time_limit, gust, copy
+        self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        self.states = np.zeros((num_envs, 2), np.float32)
+        self.elapsed = np.zeros(num_envs, dtype=int)
+
+    def reset(self, *, seed=None, options=None):
+        """Start all episodes."""
+        super().reset(seed=seed)
+        self._start(np.ones(self.num_envs, dtype=bool))
+        return self.observe(), {}
+
+    def step(self, actions):
+        """Move every drone by one step; see the class for what ends an episode."""
+        thrust = 2 * np.clip(np.asarray(actions)[:, 0], -1, 1)
+        self.states[:, 1] += 0.2 * (thrust + self.gust * self.np_random.standard_normal(self.num_envs))
+        self.states[:, 0] += 0.2 * self.states[:, 1]
+        self.elapsed += 1
+        heights = self.states[:, 0].copy()
+        terminated = np.abs(heights) > 3
+        truncated = ~terminated & (self.elapsed == self.time_limit)
+        ended = terminated | truncated
+        info = {}
+        if ended.any():
+            info = {"final_obs": self.states.copy(), "_final_obs": ended}
+            self._start(ended)
+        return self.observe(), np.exp(-2 * heights**2), terminated, truncated, info
+
+    def observe(self):
+        """Height and speed of every drone, (N, 2): with copy=False, the array itself."""
+        return self.states.copy() if self.copy else self.states
+
+    def _start(self, which):
+        count = which.sum()
+        self.states[which, 0] = self.np_random.uniform(-1.5, 1.5, count)
+        self.states[which, 1] = 0.5 * self.np_random.standard_normal(count)
+        self.elapsed[which] = 0
 
 
 class BalanceTask:

@@ -285,6 +285,33 @@ def train_ppo(envs, settings, seed=0, policy=None, reward=None, log=None, update
     return policy
 
 
+def repaired_rollout(envs, policy, num_steps, obs, generator):
+    """What the suspect program of the bug lab should have recorded.
+
+    Args and returns are those of collect_rollout. `envs` may hand out one array again and
+    again, and overwrite it at every step (`copy=False` in Gymnasium's vector environments).
+
+    Args:
+      envs: a vector environment of N environments with same-step autoreset.
+      policy: `policy.act(obs, generator)` samples actions (N, *act) for obs (N, *obs).
+      num_steps: T.
+      obs: (N, *obs), what the environments show now.
+      generator: torch generator, the only source of the actions' randomness.
+
+    Returns: Rollout of (T, N) steps, float32, that no later step of envs changes.
+    """
+    bounds = envs.single_action_space
+    steps = []
+    for _ in range(num_steps):
+        before = torch.as_tensor(obs, dtype=torch.float32).clone()  # the next step overwrites what obs holds
+        actions = policy.act(before, generator)
+        obs, rewards, terminated, truncated, info = envs.step(actions.numpy().clip(bounds.low, bounds.high))
+        steps.append((before, actions, rewards, true_next_obs(obs, info), terminated, truncated))
+    columns = [torch.as_tensor(np.stack(column)) for column in zip(*steps, strict=True)]
+    columns.append(torch.as_tensor(obs).clone())
+    return Rollout(*(column.float() if column.is_floating_point() else column for column in columns))
+
+
 def fast_ppo_update(policy, optimizer, batch, settings, generator):
     """What ppo_update does, up to rounding, in a fifth of its time.
 

@@ -1,15 +1,11 @@
 """The statistics behind thresholds, and the bar that every artefact's must pass."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-import safetensors.numpy
 
 from autograder import artefacts, calibration, checks
 from autograder.spec import Artefact
 from course_lib import records
-from course_lib.flight import TASKS
 
 ARTEFACTS = [exercise for exercise in checks.all_exercises() if isinstance(exercise, Artefact)]
 
@@ -58,30 +54,40 @@ def test_a_row_counts_full_and_half_points():
     assert first.least <= first.middle <= first.most and first.middle == pytest.approx(260, abs=5)
 
 
-def test_the_agents_of_an_experiment_are_flown_once_as_the_judge_flies(tmp_path, monkeypatch):
-    policy = safetensors.numpy.save({name: np.full(shape, 0.01, np.float32) for name, shape in TASKS["lander"].tensors.items()})
-    for variant, configuration in (("ours", {}), ("broken_sign", {"mistake": "It descends."}), ("no_clip", {})):
-        for seed in range(2 if variant == "ours" else 1):
-            provenance = {"variant": variant, "seed": seed, "configuration": configuration}
-            records.write(tmp_path / "runs" / "lander" / f"{variant}-{seed}.parquet", [{"env_steps": 1}], provenance)
-            (tmp_path / "runs" / "lander" / f"{variant}-{seed}.safetensors").write_bytes(policy)
-    monkeypatch.setattr(calibration, "cache_folder", lambda: tmp_path)
-    train = Artefact("train", lambda: None, "f", "lander", 4.0, (0.0, 200.0), episodes=3, experiment="lander")
-    found = {group.variant: group for group in calibration.groups(train, tmp_path / "runs")}
-    assert {variant: (group.mistake, group.returns.shape) for variant, group in found.items()} == {
-        "broken_sign": ("It descends.", (1, 3)),
-        "ours": ("", (2, 3)),
+def test_the_agents_of_an_experiment_are_those_trained_for_it(tmp_path):
+    configurations = {
+        "no_clip": {},
+        "broken_mask": {"mistake": "It looks away."},
+        "broken_sign": {"mistake": "It descends."},
+        "ours": {},
     }
-    judged, _ = artefacts.judge(replace(artefacts.hidden(train), file="ours-0.safetensors"), tmp_path / "runs" / "lander", 60)
-    assert f"Mean return {found['ours'].returns[0].mean():.1f} over 3 episodes" in judged.message
-    monkeypatch.setattr(artefacts, "fly", None)
-    again = {group.variant: group for group in calibration.groups(train, tmp_path / "runs")}
-    assert np.array_equal(again["ours"].returns, found["ours"].returns)
+    for variant, configuration in configurations.items():
+        for seed in range(2 if variant == "ours" else 1):
+            summary = {"eval_returns": [1.0, 2.0, 3.0]}
+            provenance = {"variant": variant, "seed": seed, "configuration": configuration, "summary": summary}
+            records.write(tmp_path / "lander" / f"{variant}-{seed}.parquet", [{"env_steps": 1}], provenance)
+    train = Artefact("train", lambda: None, "f", "lander", 4.0, (0.0, 200.0), experiment="lander", wrong=["broken_sign"])
+    assert [(group.variant, group.mistake, group.returns.shape) for group in calibration.groups(train, tmp_path)] == [
+        ("ours", "", (2, 3)),
+        ("broken_sign", "It descends.", (1, 3)),
+        ("broken_mask", "It looks away.", (1, 3)),
+    ]
 
 
 @pytest.mark.parametrize("artefact", ARTEFACTS, ids=lambda artefact: artefact.name)
 def test_a_right_agent_earns_all_points_and_a_wrong_one_not_half_of_them(artefact):
-    rows = calibration.rows(artefact, calibration.groups(artefact))
-    assert sum(row.agents for row in rows if not row.mistake) >= 20 and sum(row.agents for row in rows if row.mistake) >= 20
-    assert [row for row in rows if not row.mistake and (row.full < row.agents or row.chance > calibration.BAR)] == []
-    assert [row for row in rows if row.mistake and (row.half or row.chance > calibration.BAR)] == []
+    rows = {row.variant: row for row in calibration.rows(artefact, calibration.groups(artefact))}
+    right, wrong = rows[artefact.right], [rows[variant] for variant in artefact.wrong]
+    assert right.agents >= 20 and sum(row.agents for row in wrong) >= 20
+    assert right.full == right.agents and right.chance <= calibration.BAR
+    assert [row for row in wrong if row.half or row.chance > calibration.BAR_WRONG] == []
+
+
+@pytest.mark.parametrize("artefact", ARTEFACTS, ids=lambda artefact: artefact.name)
+def test_the_judge_flies_a_policy_as_its_run_was_evaluated(artefact):
+    known = records.load(artefact.experiment)
+    seed = known.seeds(artefact.right)[0]
+    judged = artefacts.fly(artefacts.hidden(artefact), known.artefact(artefact.right, seed, "safetensors").read_bytes(), 120)
+    recorded = known.summary(artefact.right, "eval_returns")[0]
+    error = np.hypot(judged.std(), recorded.std()) / np.sqrt(len(judged))
+    assert abs(judged.mean() - recorded.mean()) < 4 * error

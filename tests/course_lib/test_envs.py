@@ -5,7 +5,7 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 
-from course_lib.envs import BalanceTask, ChainVectorEnv, TimerVectorEnv, make
+from course_lib.envs import BalanceTask, ChainVectorEnv, HoverVectorEnv, TimerVectorEnv, begun, make
 
 
 def quiet(**options):
@@ -184,3 +184,43 @@ def test_timers_end_when_and_as_told():
 def test_timers_refuse_impossible_lengths(options):
     with pytest.raises(ValueError, match="lengths"):
         TimerVectorEnv(**options)
+
+
+def test_a_drone_follows_its_equations_up_to_the_limit():
+    envs = HoverVectorEnv(num_envs=2, time_limit=2, gust=0.0)
+    before, _ = envs.reset(seed=0)
+    assert envs.observation_space.contains(before) and envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    speeds = before[:, 1] + 0.2 * 2 * np.array([1.0, -0.5])
+    obs, rewards, terminated, truncated, info = envs.step(np.array([[3.0], [-0.5]]))  # a thrust of 3 is one of 1
+    np.testing.assert_allclose(obs, np.stack([before[:, 0] + 0.2 * speeds, speeds], axis=1), rtol=1e-5)
+    np.testing.assert_allclose(rewards, np.exp(-2 * obs[:, 0] ** 2), rtol=1e-5)
+    assert not terminated.any() and not truncated.any() and info == {}
+    obs, _, terminated, truncated, info = envs.step(np.zeros((2, 1)))
+    assert truncated.all() and not terminated.any() and (np.abs(obs[:, 0]) <= 1.5).all()
+    np.testing.assert_allclose(info["final_obs"][:, 1], speeds, rtol=1e-5)
+
+
+def test_a_drone_that_flies_away_is_lost():
+    envs = begun(HoverVectorEnv(num_envs=3, gust=0.0), seed=1, steps=4, action=1.0)
+    ends = [envs.step(np.ones((3, 1)))[2:4] for _ in range(10)]
+    assert np.any([terminated for terminated, _ in ends], axis=0).all() and not np.any([truncated for _, truncated in ends])
+
+
+def test_a_drones_array_is_reused_only_where_one_asks_for_it():
+    for copy in (True, False):
+        envs = HoverVectorEnv(num_envs=2, copy=copy)
+        before, _ = envs.reset(seed=0)
+        kept = before.copy()
+        after = envs.step(np.ones((2, 1)))[0]
+        assert (before is after) is not copy and np.array_equal(before, kept) is copy
+
+
+@pytest.mark.parametrize("options", [{"time_limit": 0}, {"gust": -0.1}])
+def test_a_drone_refuses_impossible_options(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        HoverVectorEnv(**options)
+
+
+def test_begun_environments_have_been_reset_and_stepped():
+    envs = begun(TimerVectorEnv(lengths=(3, 5), terminates=(True, True)), seed=0, steps=4)
+    assert envs.observe().tolist() == [[1.0], [4.0]]

@@ -138,3 +138,11 @@ def test_what_is_built_is_built_anew_for_every_observation():
 
     arguments = {"envs": built("envs.ChainVectorEnv", num_envs=2, slip=0.0), "actions": np.array([1, 0])}
     assert observe(step, arguments).outputs[""].tolist() == observe(step, arguments).outputs[""].tolist()
+
+
+def test_a_generators_state_can_be_looked_at():
+    given = {"generator": built("seeding.generator", seed=3)}
+    seen = observe(lambda generator: torch.rand(2, generator=generator), given, returns=["generator"])
+    expected = torch.Generator().manual_seed(3)
+    torch.rand(2, generator=expected)
+    np.testing.assert_array_equal(seen.outputs[""], expected.get_state().numpy())

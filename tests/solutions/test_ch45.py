@@ -3,10 +3,11 @@
 import copy
 import math
 
+import numpy as np
 import pytest
 import torch
 
-from course_lib.envs import ChainVectorEnv, TimerVectorEnv, make
+from course_lib.envs import ChainVectorEnv, HoverVectorEnv, TimerVectorEnv, make
 from course_lib.policies import Adam, make_policy
 from course_lib.ppo import Batch, PPOSettings
 from solutions import ch45
@@ -268,3 +269,17 @@ def test_advantages_are_normalised_unless_told_otherwise():
     batch, explained = ch45.estimate(policy, rollout, settings.but(normalize_advantages=False))
     torch.testing.assert_close(batch.returns - 10, batch.advantages)
     assert batch.returns.view(6, 2)[2].tolist() == pytest.approx([2.0, 2 + 9]) and explained.item() == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("copy", [True, False])
+def test_the_repaired_rollout_keeps_what_the_policy_saw(copy):
+    envs, policy = HoverVectorEnv(num_envs=3, time_limit=4, copy=copy), make_policy(2, 1, hidden=4)
+    start = envs.reset(seed=0)[0].copy()
+    rollout = ch45.repaired_rollout(envs, policy, 10, envs.observe(), seeded())
+    goes_on = ~(rollout.terminated | rollout.truncated)[:-1]
+    assert torch.equal(rollout.obs[0], torch.from_numpy(start))
+    assert torch.equal(rollout.obs[1:][goes_on], rollout.next_obs[:-1][goes_on])
+    assert (rollout.obs != rollout.next_obs).any(-1).all()
+    before = rollout.last_obs.clone()
+    envs.step(np.ones((3, 1)))
+    assert torch.equal(rollout.last_obs, before)
