@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -963,7 +964,7 @@ def _five_certain(true_returns_a, true_returns_b, temperature, generator):
     return torch.tensor([True, False, True, False, False])
 
 
-_FREQUENCIES = {"view": "group_frequencies", "atol": _SPREAD}
+_FREQUENCIES: dict[str, Any] = {"view": "group_frequencies", "atol": _SPREAD}
 
 SIMULATE_PREFERENCES = Exercise(
     name="simulate_preferences",
