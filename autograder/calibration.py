@@ -1,10 +1,11 @@
 """Where the thresholds of an exercise that is judged by a file come from: agents trained rightly and wrongly, and how they flew.
 
 The bar: of right agents, at most one in a hundred earns less than all points; of those with a mistake that a flight must show
-(`Artefact.wrong`), none earns half of them, and of further ones at most one in twenty, which is as much as five agents can show. Other mistakes let an agent land all the same: only the checks of
-functions find those, and the table says how often they land. A student's luck is the seed of a training, since the judge's
-episodes are the same for all; the recorded ones begin from other seeds. Twenty agents cannot show a hundredth by counting, so the
-chance that a further agent crosses a mark is taken to be the larger of two estimates:
+(`Artefact.wrong`), none earns half of them, and of further ones at most one in twenty, which is as much as five agents can show.
+Other mistakes let an agent land all the same: only the checks of functions find those, and the table says how often they land. A
+student's luck is the seed of a training, since the judge's episodes are the same for all; the recorded ones begin from other
+seeds. Twenty agents cannot show a hundredth by counting, so the chance that a further agent crosses a mark is taken to be the
+larger of two estimates:
 
 - bootstrap: draw one of the agents, and as many of its episodes as the judge flies, with replacement; how often does the mean cross?
   It keeps the shape of what was seen, and counts the luck of the episodes as if the judge drew new ones;
