@@ -71,3 +71,22 @@ def steps_made(_arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray])
     if "steps" not in outputs:
         raise ValueError("there is no number of steps")
     return {"steps": outputs["steps"]}
+
+
+def group_frequencies(arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What all honest draws of answers have in common: how often each kind of pair is answered True.
+
+    Args:
+      arguments: true_returns_a and true_returns_b, (B,); pairs that are equal in both, and that follow one another, are of one kind.
+      outputs: for each call its answers, (B,) bool.
+
+    Returns: "frequency", (kinds,), over all calls together; "alike", whether two calls gave the very same answers.
+    """
+    pairs = np.stack([arguments["true_returns_a"], arguments["true_returns_b"]])
+    answers = list(outputs.values())
+    if not answers or any(given.dtype != bool or given.shape != pairs.shape[1:] for given in answers):
+        raise ValueError(f"the answers must be a bool tensor of shape {pairs.shape[1:]}")
+    starts = np.flatnonzero(np.r_[True, (np.diff(pairs) != 0).any(0)])
+    frequencies = [[part.mean() for part in np.split(given, starts[1:])] for given in answers]
+    alike = len(answers) > 1 and all(np.array_equal(given, answers[0]) for given in answers)
+    return {"frequency": np.mean(frequencies, axis=0), "alike": np.asarray(alike)}

@@ -62,3 +62,26 @@ def test_of_an_optimiser_its_steps():
     assert views.steps_made({}, {"steps": np.array(3), "moments.0": np.ones(4)}) == {"steps": 3}
     with pytest.raises(ValueError):
         views.steps_made({}, {"moments.0": np.ones(4)})
+
+
+KINDS = {"true_returns_a": np.repeat([1.0, 2.0, 2.0], 4), "true_returns_b": np.repeat([0.0, 2.0, 1.0], 4)}
+
+
+def test_answers_are_counted_by_kind_of_pair():
+    answers = np.array([1, 1, 1, 1, 1, 0, 0, 1, 0, 0, 0, 1], dtype=bool)
+    once = views.group_frequencies(KINDS, {"": answers})
+    assert once["frequency"].tolist() == [1, 0.5, 0.25] and not once["alike"]
+    assert views.group_frequencies(KINDS, {"0": answers, "1": answers})["alike"]
+    twice = views.group_frequencies(KINDS, {"0": answers, "1": ~answers})
+    assert twice["frequency"].tolist() == [0.5, 0.5, 0.5] and not twice["alike"]
+
+
+@pytest.mark.parametrize("answers", [np.ones(12), np.ones(3, dtype=bool), np.ones((12, 1), dtype=bool)])
+def test_answers_that_are_no_bools_for_each_pair_cannot_be_read(answers):
+    with pytest.raises(ValueError, match="bool tensor of shape"):
+        views.group_frequencies(KINDS, {"": answers})
+
+
+def test_no_answers_cannot_be_read():
+    with pytest.raises(ValueError, match="bool tensor"):
+        views.group_frequencies(KINDS, {})

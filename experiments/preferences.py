@@ -1,0 +1,243 @@
+"""Rewards learned from comparisons of clips, and what PPO makes of them: CartPole, Pendulum, and a car whose passenger is misread."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields
+
+import torch
+
+from course_lib import clips, envs, tasks
+from course_lib.policies import make_policy, policy_for
+from course_lib.ppo import PPOSettings
+from experiments.runner import Result
+from solutions.ch45 import collect_rollout, evaluate_actions, fast_ppo_update, train_ppo
+from solutions.ch80 import bradley_terry_loss, preference_accuracy, segment_returns, simulate_preferences
+
+COMPARISONS = (0, 30, 100, 300, 1000, 3000)
+NOISE = {
+    "sure": 0.02,
+    "unsure": 0.5,
+    "guessing": 2.0,
+}  # the person's temperature, in standard deviations of the clips' true returns
+KL_COEFS = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0)
+
+VARIANTS: dict[str, dict] = {
+    **{f"cruise_{kl_coef:g}": {"task": "cruise", "comparisons": 100, "noise": 0.5, "kl_coef": kl_coef} for kl_coef in KL_COEFS},
+    "cruise_rounds": {"task": "cruise", "comparisons": 100, "noise": 0.5, "rounds": 5},
+    **{f"{task}_true": {"task": task, "comparisons": None} for task in ("cruise", "pendulum", "cartpole")},
+    **{
+        f"{task}_{count}_{noise}": {"task": task, "comparisons": count, "noise": NOISE[noise]}
+        for task, noises in (("pendulum", ("sure", "unsure", "guessing")), ("cartpole", ("sure", "unsure")))
+        for noise in noises
+        for count in COMPARISONS
+        if count or noise == "sure"
+    },
+    "pendulum_rounds": {"task": "pendulum", "comparisons": 300, "noise": NOISE["unsure"], "rounds": 5},
+    "cartpole_rounds": {"task": "cartpole", "comparisons": 300, "noise": NOISE["sure"], "rounds": 5},
+}
+SEEDS = 5
+
+SETTINGS = {
+    "cartpole": PPOSettings(
+        total_steps=49_152,
+        num_steps=128,
+        minibatch_size=256,
+        num_epochs=6,
+        learning_rate=2e-3,
+        gamma=0.99,
+        gae_lambda=0.95,
+    ),
+    "pendulum": PPOSettings(
+        total_steps=96_000,
+        num_steps=200,
+        minibatch_size=320,
+        num_epochs=8,
+        learning_rate=2e-3,
+        gamma=0.95,
+        gae_lambda=0.95,
+        ent_coef=0.0,
+    ),
+    "cruise": PPOSettings(
+        total_steps=64_000,
+        num_steps=50,
+        minibatch_size=320,
+        num_epochs=6,
+        learning_rate=1e-3,
+        gamma=0.9,
+        gae_lambda=0.95,
+        ent_coef=0.0,
+    ),
+}
+TRUE_SCALE = {"cartpole": 1.0, "pendulum": 0.1, "cruise": 1.0}  # what the true rewards are multiplied by when PPO sees them
+CLIP_LENGTH = {"cartpole": 50, "pendulum": 25, "cruise": 10}
+HORIZON = {"cartpole": 500, "pendulum": 200, "cruise": 50}  # steps of a whole episode
+POOL = 1000  # clips that all comparisons are drawn from
+HELD_OUT = 500
+
+
+def make_envs(task, num_envs=32, time_limit=None):
+    """N copies of a task; a time limit shorter than its own lets clips begin in more places."""
+    if task == "cartpole":
+        return envs.make("CartPole-v1", num_envs)
+    kind = tasks.PendulumVectorEnv if task == "pendulum" else tasks.CruiseVectorEnv
+    return kind(num_envs, time_limit=time_limit or HORIZON[task])
+
+
+def first_policy(task, seed):
+    """Who drives in the first clips, and where PPO begins: an untrained policy, or a driver who asks for a speed of 0.4."""
+    if task != "cruise":
+        return policy_for(make_envs(task, 1), seed=seed)
+    driver = make_policy(1, 1, log_std=math.log(0.15), seed=seed)
+    driver.tensors()["actor.out.bias"].fill_(-0.8)
+    return driver
+
+
+def collect_clips(task, policy, count, seed):
+    """`count` clips of a policy, in random order."""
+    generator, length = torch.Generator().manual_seed(seed), CLIP_LENGTH[task]
+    world = make_envs(task, 32 if task == "cartpole" else 250, time_limit=length if task == "pendulum" else None)
+    obs = world.reset(seed=seed)[0]
+    found: list[clips.Segments] = []
+    while sum(len(part) for part in found) < count:
+        rollout = collect_rollout(world, policy, 250 if task == "cartpole" else 2 * length, obs, generator)
+        found.append(clips.cut(rollout, length))
+        obs = rollout.last_obs
+    together = joined(found)
+    return together[torch.randperm(len(together), generator=generator)[:count]]
+
+
+def joined(parts):
+    """Several Segments as one."""
+    columns = [field.name for field in fields(clips.Segments)]
+    return clips.Segments(*(torch.cat([getattr(part, column) for part in parts]) for column in columns))
+
+
+def ask(pool, comparisons, noise, seed):
+    """Show a simulated person pairs of clips. Returns: (chosen, rejected, share of answers against the better clip)."""
+    generator = torch.Generator().manual_seed(seed)
+    first, second = clips.draw_pairs(len(pool), comparisons, generator)
+    returns = segment_returns(pool.rewards, pool.mask).double()
+    temperature = max(noise * returns.std().item(), 1e-3)  # clips may all be alike
+    answers = simulate_preferences(returns[first], returns[second], temperature, generator)
+    differ = returns[first] != returns[second]
+    mistakes = differ & (answers != (returns[first] > returns[second]))
+    chosen, rejected = torch.where(answers, first, second), torch.where(answers, second, first)
+    return pool[chosen], pool[rejected], mistakes.sum().item() / max(differ.sum().item(), 1)
+
+
+def preference_loss(model, chosen, rejected):
+    """The Bradley-Terry loss of a minibatch of pairs."""
+    better, worse = (segment_returns(model(clip.obs, clip.actions), clip.mask) for clip in (chosen, rejected))
+    return bradley_terry_loss(better, worse)
+
+
+def quality(model, held_out):
+    """How well a reward model foresees fresh clips of the first policy, without anybody's mistakes."""
+    rewards = model(held_out.obs, held_out.actions)
+    returns, truth = segment_returns(rewards, held_out.mask), segment_returns(held_out.rewards, held_out.mask)
+    (first, second), (true_first, true_second) = returns.view(2, -1), truth.view(2, -1)
+    differ, better = true_first != true_second, true_first > true_second
+    chosen, rejected = torch.where(better, first, second), torch.where(better, second, first)
+    return {
+        "accuracy": preference_accuracy(chosen[differ], rejected[differ]).item(),
+        "correlation_clips": correlation(returns, truth),
+        "correlation_steps": correlation(rewards[held_out.mask], held_out.rewards[held_out.mask]),
+    }
+
+
+def correlation(x, y):
+    """Pearson's correlation of two tensors of numbers, NaN where one is constant."""
+    x, y = (numbers.double() - numbers.double().mean() for numbers in (x, y))
+    norm = (x.norm() * y.norm()).item()
+    return (x @ y).item() / norm if norm > 0 else math.nan
+
+
+def frozen_reward(task, model, pool):
+    """The learned reward as PPO gets it, `reward(obs, actions, next_obs) -> (T, N)`, on a scale fixed by the clips.
+
+    Its level is nobody's choice where all clips are of one length: the mean becomes 0. Where episodes end, the level decides whether it
+    pays to go on; there the comparisons have told it, and only the unit changes.
+    """
+    model.requires_grad_(False)
+    rewards = model(pool.obs, pool.actions)[pool.mask]
+    level, scale = (0.0, rewards.square().mean().sqrt()) if task == "cartpole" else (rewards.mean(), rewards.std())
+
+    def reward(obs, actions, next_obs):
+        seen = next_obs if task == "cruise" else obs  # a step of the car is judged by the speed that it leads to
+        return (model(seen, actions.float().view(*obs.shape[:-1], -1)) - level) / (scale + 1e-8)
+
+    return reward
+
+
+def log_ratios(policy, reference, obs, actions):
+    """log π(a|s) - log π_ref(a|s) of every step, (T, N); its mean over the policy's own steps is the divergence from the reference."""
+    ours, theirs = (evaluate_actions(one, obs.flatten(0, 1), actions.flatten(0, 1))[0].detach() for one in (policy, reference))
+    return (ours - theirs).view(obs.shape[:2])
+
+
+def run(variant, seed, checkpoint_dir, report):
+    """Collect clips, ask for comparisons, fit a reward, train PPO on it, in one round or several; then look at the true return."""
+    choice = VARIANTS[variant]
+    task, rounds, kl_coef = choice["task"], choice.get("rounds", 1), choice.get("kl_coef", 0.0)
+    settings = SETTINGS[task].but(total_steps=SETTINGS[task].total_steps // rounds)
+    policy, reference = first_policy(task, 100 + seed), first_policy(task, 100 + seed)
+    rows: list[dict] = []
+    summary: dict = {}
+
+    def train(round_number, learned):
+        before = rows[-1]["env_steps"] if rows else 0
+        latest: dict[str, float] = {}
+
+        def reward(obs, actions, next_obs):
+            paid = learned(obs, actions, next_obs)
+            log_ratio = log_ratios(policy, reference, obs, actions)
+            latest.update(learned=paid.mean().item(), kl=log_ratio.mean().item())
+            return paid - kl_coef * log_ratio
+
+        def log(row):
+            rows.append({"env_steps": before + row["env_steps"], "mean_return": row["mean_return"]} | latest)
+            report(before + row["env_steps"], settings.total_steps * rounds)
+
+        scale = 1.0 if learned else TRUE_SCALE[task]
+        world = make_envs(task)
+        train_ppo(
+            world, settings.but(reward_scale=scale), seed + 10 * round_number, policy, learned and reward, log, fast_ppo_update
+        )
+
+    def judge(learned):
+        generator = torch.Generator().manual_seed(2000 + seed)
+        world = make_envs(task, 64)
+        rollout = collect_rollout(world, policy, HORIZON[task], world.reset(seed=2000 + seed)[0], generator)
+        ended = (rollout.terminated | rollout.truncated).int()
+        kept = ended.cumsum(0) - ended == 0  # each environment's first episode
+        summary["true_return"] = (rollout.rewards * kept).sum(0).mean().item()
+        if learned:
+            given = learned(rollout.obs, rollout.actions, rollout.next_obs)
+            summary["learned_return"] = (given * kept).sum(0).mean().item()
+            summary["correlation_on_policy"] = correlation(given[kept], rollout.rewards[kept])
+        if task == "cruise":
+            summary["kl"] = log_ratios(policy, reference, rollout.obs, rollout.actions).mean().item()
+            summary["speed"] = rollout.next_obs.mean().item()
+
+    if choice["comparisons"] is None:
+        train(0, None)
+        judge(None)
+        return Result(rows, summary)
+
+    asked: list = []
+    for round_number in range(rounds):
+        pool = collect_clips(task, policy, POOL // rounds, seed + 10 * round_number)
+        if choice["comparisons"]:
+            asked.append(ask(pool, choice["comparisons"] // rounds, choice["noise"], seed + 10 * round_number))
+        actions = 0 if task == "cruise" else pool.actions.shape[-1]
+        model = clips.RewardModel(pool.obs.shape[-1], actions, seed=seed).scale_to(pool)
+        if asked:
+            chosen, rejected = (joined(parts) for parts in list(zip(*asked, strict=True))[:2])
+            losses = clips.fit(model, chosen, rejected, preference_loss, seed=seed)
+            summary |= {"mistakes": sum(entry[2] for entry in asked) / rounds, "loss": losses[-20:].mean().item()}
+        learned = frozen_reward(task, model, pool)
+        train(round_number, learned)
+    summary |= quality(model, collect_clips(task, reference, HELD_OUT, 1000 + seed))
+    judge(learned)
+    return Result(rows, summary)
