@@ -27,6 +27,7 @@ from nbformat.v4 import new_code_cell, new_notebook
 
 from autograder.chapter import Cell, Chapter
 from autograder.paths import COURSE_LIB, ROOT
+from course_lib.chapters import REFERENCES
 
 CELL_TIMEOUT = 300  # seconds; a page's cells together should need at most 60
 
@@ -148,6 +149,7 @@ def _environment(folder: str) -> dict[str, str]:
     inherited = {name: value for name, value in os.environ.items() if name not in {"MPLBACKEND", "PYTHONSTARTUP"}}
     return inherited | {
         "COURSE_BOOK": "1",
+        REFERENCES: "solutions",
         "OMP_NUM_THREADS": "1",
         "PYTHONPATH": str(ROOT),
         "PYTHONHASHSEED": "0",

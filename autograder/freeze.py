@@ -13,8 +13,8 @@ from typing import Any
 import torch
 
 from autograder.spec import Case, Exercise
-from course_lib.cases import FrozenCase, FrozenExercise, save
-from course_lib.diagnosis import differing_facets, signature
+from course_lib.cases import FrozenCase, FrozenExercise, Observation, save
+from course_lib.diagnosis import differing_facets, signature, view
 from course_lib.runner import observe
 
 
@@ -54,21 +54,27 @@ def _exercise(exercise: Exercise, cases: list[FrozenCase]) -> FrozenExercise:
 
 
 def _freeze(exercise: Exercise, case: Case, seed: int, draw: int, is_visible: bool) -> FrozenCase:
-    inputs = {name: _plain(value, case.dtype) for name, value in case.inputs(_generator(exercise, case, seed, draw)).items()}
-
-    def seen(function: Callable) -> Any:
-        return observe(function, inputs, case.differentiate)
-
+    inputs = _plain(case.inputs(_generator(exercise, case, seed, draw)), case.dtype)
     frozen = FrozenCase(
         name=case.name,
         arguments=inputs,
-        expected=[seen(right) for right in (exercise.reference, *exercise.also_right)],
-        misconceptions={mistake.name: seen(mistake.function) for mistake in exercise.misconceptions},
+        expected=[],
         differentiate=list(case.differentiate),
+        repeat=case.repeat,
+        returns=list(case.returns),
+        view=case.view,
         raises=list(case.raises),
         facet=case.facet,
         visible=is_visible,
+        rtol=case.rtol,
+        atol=case.atol,
     )
+
+    def seen(function: Callable) -> Observation:
+        return view(frozen, observe(function, **frozen.call))
+
+    frozen.expected = [seen(right) for right in (exercise.reference, *exercise.also_right)]
+    frozen.misconceptions = {mistake.name: seen(mistake.function) for mistake in exercise.misconceptions}
     _prove(exercise, case, frozen, seen)
     return frozen
 
@@ -88,6 +94,10 @@ def _generator(exercise: Exercise, case: Case, seed: int, draw: int) -> torch.Ge
 
 
 def _plain(value: Any, dtype: torch.dtype) -> Any:
+    if isinstance(value, dict):
+        return {name: _plain(entry, dtype) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry, dtype) for entry in value]
     if isinstance(value, torch.Tensor):
         return (value.to(dtype) if value.is_floating_point() else value).numpy()
     return value

@@ -5,14 +5,11 @@ The tests demand that all misconceptions are rejected and named and all variants
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from autograder import freeze
 from autograder.spec import Exercise
-from course_lib.cases import FrozenExercise
-from course_lib.diagnosis import Finding, diagnose
-from course_lib.runner import observe
+from course_lib.diagnosis import diagnose, examine
 
 SEEDS = 50
 
@@ -59,10 +56,5 @@ def exercise_rows(exercise: Exercise, seeds: int = SEEDS) -> ExerciseRows:
             row.rejected += finding.score < finding.max_score
             row.named += finding.misconceptions == [row.name]
         for variant in result.variants:
-            variant.accepted += run(exercise.variants[variant.name], frozen).state == "correct"
+            variant.accepted += examine(frozen, exercise.variants[variant.name]).state == "correct"
     return result
-
-
-def run(function: Callable, frozen: FrozenExercise) -> Finding:
-    """Judge a trusted function in this process."""
-    return diagnose(frozen, [observe(function, case.arguments, case.differentiate) for case in frozen.cases])

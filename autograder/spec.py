@@ -12,6 +12,8 @@ from typing import Any
 
 import torch
 
+from course_lib.cases import FrozenCase
+
 Inputs = Callable[[torch.Generator], dict[str, Any]]
 
 
@@ -19,10 +21,11 @@ Inputs = Callable[[torch.Generator], dict[str, Any]]
 class Case:
     """One kind of call.
 
-    `inputs` draws the arguments (float64 tensors, scalars) from a seeded generator. `closed_form` takes the same arguments and gives the
-    answer by another route; the reference is held against it whenever the case is frozen. `differentiate` names the arguments that
-    require gradient: what the reference passes on to each is the contract. `raises` names the arguments of which a ValueError must
-    mention one. A visible case is also shown to learners, with one draw; the judge takes `draws` of every case.
+    `inputs` draws the arguments (float64 tensors, scalars, course_lib.cases.built objects) from a seeded generator. `closed_form`
+    takes the same arguments and gives the answer by another route; the reference is held against it whenever the case is frozen.
+    `differentiate` names the arguments that require gradient: what the reference passes on to each is the contract. `raises` names
+    the arguments of which a ValueError must mention one. `repeat`, `returns` and `view` say how the function is called and looked
+    at (course_lib.cases.FrozenCase). A visible case is also shown to learners, with one draw; the judge takes `draws` of every case.
     """
 
     name: str
@@ -30,6 +33,11 @@ class Case:
     closed_form: Callable | None = None
     differentiate: Sequence[str] = ()
     raises: Sequence[str] = ()
+    repeat: int = 1
+    returns: Sequence[str] = ()
+    view: str = ""
+    rtol: float = FrozenCase.rtol
+    atol: float = FrozenCase.atol
     dtype: torch.dtype = torch.float64
     visible: bool = False
     draws: int = 2

@@ -8,7 +8,7 @@ The conversation, in frames of course_lib.cases.encode, over the stream socket w
     worker  {"ready": true}
     judge   {"cells": [[number, source], …]}
     worker  {"running": number} before each cell, then {"loaded": {number: error text}}
-    judge   {"exercise": name, "seconds": s, "cases": [{"arguments": …, "differentiate": …}, …]}
+    judge   {"exercise": name, "seconds": s, "cases": [arguments of observe, …]}
     worker  {"observations": […]} | {"missing": true} | {"ended": "timeout" or "exit"}
 
 Each exercise is called in a forked child, so that what it does to its process is gone with it.
@@ -104,7 +104,7 @@ def call(channel: Channel, request: dict, namespace: dict) -> None:
     try:
         function = namespace.get(request["exercise"])
         if callable(function):
-            seen = [asdict(observe(function, case["arguments"], case["differentiate"])) for case in request["cases"]]
+            seen = [asdict(observe(function, **case)) for case in request["cases"]]
             channel.send({"observations": seen})
         else:
             channel.send({"missing": True})

@@ -26,14 +26,24 @@ FACET_TEXT = {
 }
 
 
+def built(maker: str, **arguments: Any) -> dict[str, Any]:
+    """An argument that is made anew for each call, where the function runs: `built("seeding.generator", seed=5)`.
+
+    Args:
+      maker: a public class or function of course_lib, as "module.name".
+      arguments: what it is called with; plain data, arrays, or `built` again.
+    """
+    return {"@built": maker, "arguments": arguments}
+
+
 @dataclass
 class Observation:
     """What one call of a function did.
 
     `error` is the name of the exception it raised ("" if it returned) and `message` its text. `kind` says what came back
-    ("tensor", "tuple", "dict", or the name of another type); `outputs` holds the tensors: key "" for a single one, the position
-    or the key otherwise. `graph` names the outputs that carry a graph, `gradients` has the gradient of each differentiated
-    argument (None: no gradient reaches it), `mutated` names the arguments that the call changed.
+    ("tensor", "tuple of 2", or the name of another type); `outputs` holds its tensors and numbers: key "" for a single one, the
+    path to it otherwise ("0", "1.entropy"). `graph` names the outputs that carry a graph, `gradients` has the gradient of each
+    differentiated argument (None: no gradient reaches it), `mutated` names the arguments that the call changed.
     """
 
     error: str = ""
@@ -49,8 +59,10 @@ class Observation:
 class FrozenCase:
     """One call: its arguments, every observation that counts as right, and what each misconception would show.
 
-    `differentiate` names the arguments that require gradient. `facet` is what an unexpected exception costs. Where the call must
-    raise, `raises` has the argument names of which the ValueError must mention one.
+    `differentiate` names the arguments that require gradient. The function is called `repeat` times; if `returns` names arguments,
+    what these hold afterwards is looked at, and not what the function returned. `view` is the name of a function of course_lib.views
+    through which all outputs are seen. `facet` is what an unexpected exception costs. Where the call must raise, `raises` has the
+    argument names of which the ValueError must mention one.
     """
 
     name: str
@@ -58,11 +70,19 @@ class FrozenCase:
     expected: list[Observation]
     misconceptions: dict[str, Observation] = field(default_factory=dict)
     differentiate: list[str] = field(default_factory=list)
+    repeat: int = 1
+    returns: list[str] = field(default_factory=list)
+    view: str = ""
     raises: list[str] = field(default_factory=list)
     facet: str = "values"
     visible: bool = True
     rtol: float = 1e-5  # loose enough for a style as common as `gamma * ~ended`, which PyTorch computes in single precision
     atol: float = 1e-5
+
+    @property
+    def call(self) -> dict[str, Any]:
+        """The arguments of course_lib.runner.observe, beside the function: all that the learner's process is told."""
+        return {name: getattr(self, name) for name in ("arguments", "differentiate", "repeat", "returns")}
 
 
 @dataclass

@@ -15,8 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from course_lib.cases import FACET_TEXT, FrozenExercise, load
-from course_lib.diagnosis import Finding, diagnose
-from course_lib.runner import observe
+from course_lib.diagnosis import Finding, examine
 
 FROZEN = Path(__file__).parent / "frozen"
 
@@ -89,7 +88,7 @@ def check(function: Callable) -> CheckResult:
         raise TypeError(f"check takes a function, as in check(compute_gae); it got {function!r:.80}")
     exercise = visible_cases(name)
     start = time.perf_counter()
-    finding = diagnose(exercise, [observe(function, case.arguments, case.differentiate) for case in exercise.cases])
+    finding = examine(exercise, function)
     result = CheckResult(finding, exercise, time.perf_counter() - start)
     if os.environ.get("NBGRADER_EXECUTION") == "validate" and not result.passed:
         raise AssertionError(repr(result))  # nbgrader's Validate button goes by exceptions alone

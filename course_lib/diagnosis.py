@@ -1,17 +1,19 @@
 """Compare what a function did with what was expected, and name the mistake.
 
-Used by the learner's notebook on the visible cases and by the trusted judge on all of them. Pure functions of data: nothing of the
-learner's is executed here.
+Used by the learner's notebook on the visible cases and by the trusted judge on all of them. But for `examine`, these are pure functions
+of data: nothing of the learner's is executed here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from course_lib import views
 from course_lib.cases import FACET_TEXT, FrozenCase, FrozenExercise, Observation
+from course_lib.runner import observe
 
 SINGLE_RTOL, SINGLE_ATOL = 1e-4, 1e-5
 """How far a float32 result may stray."""
@@ -30,8 +32,24 @@ class Finding:
     failed: list[str] = field(default_factory=list)
 
 
+def examine(exercise: FrozenExercise, function: Callable) -> Finding:
+    """Judge a function in this process: a learner's own notebook, or code that is trusted."""
+    return diagnose(exercise, [view(case, observe(function, **case.call)) for case in exercise.cases])
+
+
+def view(case: FrozenCase, seen: Observation) -> Observation:
+    """What the case's view makes of the outputs; of outputs that it cannot read, a kind that says why."""
+    if not case.view or seen.error:
+        return seen
+    try:
+        outputs = getattr(views, case.view)(case.arguments, seen.outputs)
+    except Exception as error:  # the outputs may be anything at all
+        return replace(seen, outputs={}, kind=f"{seen.kind} ({error})")
+    return replace(seen, outputs=outputs, graph=["" for _ in seen.graph[:1]], kind=views.READABLE)
+
+
 def diagnose(exercise: FrozenExercise, observations: Sequence[Observation]) -> Finding:
-    """Judge one function.
+    """Judge one function by what was observed of it, seen through the cases' views.
 
     Points are paid by facet, and only together with right values. A misconception is named if, in every facet in which it differs
     from the reference, the function did what the misconception does, in every case; of two that explain, one that explains
@@ -66,17 +84,23 @@ def differing_facets(seen: Observation, target: Observation, case: FrozenCase) -
     if seen.error or target.error:
         return set() if seen.error == target.error else {case.facet}
     facets = set()
-    if seen.kind != target.kind or not all(_values_agree(seen.outputs[key], target.outputs[key], case) for key in target.outputs):
+    if not _same_form(seen, target):
         facets.add("values")
-    if seen.outputs.keys() == target.outputs.keys() and any(
-        seen.outputs[key].dtype != target.outputs[key].dtype for key in target.outputs
-    ):
-        facets.add("dtype")
+    else:
+        pairs = [(seen.outputs[key], target.outputs[key]) for key in target.outputs]
+        if not all(_values_agree(*pair, case) for pair in pairs):
+            facets.add("values")
+        if any(here.dtype != there.dtype for here, there in pairs):
+            facets.add("dtype")
     if seen.graph != target.graph or not _gradients_agree(seen, target, case):
         facets.add("gradient")
     if seen.mutated != target.mutated:
         facets.add("inputs")
     return facets
+
+
+def _same_form(seen: Observation, target: Observation) -> bool:
+    return seen.kind == target.kind and seen.outputs.keys() == target.outputs.keys()
 
 
 def _differs_from_expected(case: FrozenCase, seen: Observation) -> set[str]:
@@ -92,7 +116,7 @@ def _refusal(seen: Observation, case: FrozenCase) -> str:
 
 def _close(seen: np.ndarray, target: np.ndarray, case: FrozenCase) -> np.ndarray:
     single = np.float32 in (seen.dtype, target.dtype)
-    rtol, atol = (SINGLE_RTOL, SINGLE_ATOL) if single else (case.rtol, case.atol)
+    rtol, atol = (max(case.rtol, SINGLE_RTOL), max(case.atol, SINGLE_ATOL)) if single else (case.rtol, case.atol)
     with np.errstate(all="ignore"):
         return np.isclose(seen, target, rtol=rtol, atol=atol, equal_nan=True)
 
@@ -167,7 +191,7 @@ def _descriptions(
 
 def _describe_values(exercise: FrozenExercise, case: FrozenCase, seen: Observation) -> str:
     right = case.expected[0]
-    if seen.kind != right.kind:
+    if not _same_form(seen, right):
         return f"It returns {_a(seen.kind)} where {_a(right.kind)} is asked for."
     for key, want in right.outputs.items():
         got = seen.outputs[key]

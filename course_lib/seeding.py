@@ -17,3 +17,8 @@ def seed_everything(seed: int) -> torch.Generator:
     np.random.seed(seed)
     torch.manual_seed(seed)
     return torch.Generator().manual_seed(seed)
+
+
+def generator(seed: int) -> torch.Generator:
+    """A torch generator of its own, for explicit draws."""
+    return torch.Generator().manual_seed(seed)

@@ -76,10 +76,6 @@ def test_spent_time_is_no_failure_of_ours():
 @pytest.mark.parametrize(
     "seen",
     [
-        {"kind": "tensor"},
-        {"kind": "tuple of 2"},
-        {"kind": "tuple of 2", "outputs": {"": np.ones(2)}},
-        {"kind": "tensor", "outputs": {"0": np.ones(2)}},
         {"kind": "tensor", "outputs": {"": [1.0, 1.0]}},
         {"kind": "tensor", "outputs": {"": np.array(["a"])}},
         {"kind": 1},
@@ -89,14 +85,23 @@ def test_spent_time_is_no_failure_of_ours():
     ],
     ids=repr,
 )
-def test_an_answer_that_contradicts_itself_is_refused(seen):
+def test_an_answer_of_other_things_than_text_and_numbers_is_refused(seen):
     with pytest.raises(ValueError):
         judge._observation(seen)
 
 
-@pytest.mark.parametrize("kind", ["NoneType", "float", "tuple of 0", "dict of ", "PatternOfNames"])
-def test_what_is_no_tensor_is_only_wrong(kind):
-    finding = judge.diagnose(EXERCISE, [judge._observation({"kind": kind})])
+@pytest.mark.parametrize(
+    "seen",
+    [
+        *({"kind": kind} for kind in ("NoneType", "float", "tuple of 0", "dict of ", "PatternOfNames", "tensor", "tuple of 2")),
+        {"kind": "tuple of 2", "outputs": {"": np.ones(2)}},
+        {"kind": "tensor", "outputs": {"0": np.ones(2)}},
+        {"kind": "tensor", "outputs": {"": np.ones(2), "0": np.ones(2)}},
+    ],
+    ids=repr,
+)
+def test_what_is_no_tensor_or_contradicts_itself_is_only_wrong(seen):
+    finding = judge.diagnose(EXERCISE, [judge._observation(seen)])
     assert finding.state == "wrong" and finding.score == 0
 
 

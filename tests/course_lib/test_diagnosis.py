@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from autograder import freeze, killmatrix
+from autograder import freeze
 from autograder.spec import Case, Exercise, Misconception
-from course_lib.diagnosis import diagnose
+from course_lib import views
+from course_lib.cases import built
+from course_lib.diagnosis import diagnose, examine
 
 
 def double(x, ended, gamma=0.5):
@@ -49,7 +51,7 @@ VISIBLE = freeze.visible(TOY)
 
 
 def finding(function, frozen=VISIBLE):
-    return killmatrix.run(function, frozen)
+    return examine(frozen, function)
 
 
 def test_the_reference_gets_everything_and_the_stub_nothing():
@@ -152,3 +154,49 @@ def test_a_reference_that_accepts_what_it_must_refuse_is_refused():
     broken = Exercise("double", double, {"values": 1.0}, (Case("c", _table, raises=["gamma"]),), (), {})
     with pytest.raises(freeze.FreezeError, match="does not do what the case says"):
         freeze.complete(broken)
+
+
+def _order(count, generator):
+    return torch.randperm(count, generator=generator)
+
+
+SHUFFLE = Exercise(
+    name="order",
+    reference=_order,
+    criteria={"values": 1.0},
+    cases=(
+        Case(
+            "ten",
+            lambda draws: {
+                "count": 10,
+                "generator": built("seeding.generator", seed=int(torch.randint(99, (), generator=draws))),
+            },
+            view="sorted_indices",
+            visible=True,
+        ),
+    ),
+    misconceptions=(Misconception("one-short", lambda count, generator: _order(count - 1, generator), "One is missing."),),
+    variants={},
+)
+
+
+@pytest.fixture
+def shuffle(monkeypatch):
+    def sorted_indices(arguments, outputs):
+        if outputs[""].dtype != np.int64:
+            raise ValueError("indices must be int64")
+        return {"sorted": np.sort(outputs[""])}
+
+    monkeypatch.setattr(views, "sorted_indices", sorted_indices, raising=False)
+    return freeze.complete(SHUFFLE)
+
+
+def test_a_view_lets_every_right_answer_pass_and_names_the_wrong_ones(shuffle):
+    assert examine(shuffle, lambda count, generator: torch.arange(count).flip(0)).state == "correct"
+    assert examine(shuffle, lambda count, generator: torch.arange(count - 1)).misconceptions == ["one-short"]
+
+
+def test_what_a_view_cannot_read_is_wrong_and_says_why(shuffle):
+    for unreadable in (torch.arange(10.0), (torch.arange(10),), None):
+        assert examine(shuffle, lambda count, generator, answer=unreadable: answer).state == "wrong"
+    assert "indices must be int64" in examine(shuffle, lambda count, generator: torch.arange(10.0)).message

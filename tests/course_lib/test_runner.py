@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import torch
 
-from course_lib.cases import Observation
+from course_lib.cases import Observation, built
 from course_lib.runner import observe
 
 X = {"x": np.array([1.0, 2.0, 3.0]), "scale": 2.0}
@@ -32,7 +32,7 @@ def test_tuples_and_dicts_are_taken_apart():
 
 
 def test_other_results_are_named_by_type():
-    assert observe(lambda x, scale: 3.0, X) == Observation(kind="float")
+    assert observe(lambda x, scale: 3.0, X) == Observation(kind="float", outputs={"": np.array(3.0)})
     assert observe(lambda x, scale: None, X).kind == "NoneType"
 
 
@@ -95,3 +95,46 @@ def test_flags_and_indices_keep_their_dtypes():
     kinds = {}
     observe(lambda mask, ids: kinds.update(mask=mask.dtype, ids=ids.dtype), {"mask": np.array([True]), "ids": np.array([3])})
     assert kinds == {"mask": torch.bool, "ids": torch.int64}
+
+
+def test_nested_results_are_flattened_to_paths():
+    seen = observe(lambda x, scale: (x, {"entropy": x.mean(), "steps": 3}), X)
+    assert seen.kind == "tuple of 2 (tensor, dict of entropy, steps (int))"
+    assert list(seen.outputs) == ["0", "1.entropy", "1.steps"]
+
+
+def test_generators_are_consumed_and_go_on_from_call_to_call():
+    def orders(count, generator):
+        yield from torch.randperm(count, generator=generator).split(2)
+
+    arguments = {"count": 4, "generator": built("seeding.generator", seed=3)}
+    once, twice = observe(orders, arguments), observe(orders, arguments, repeat=2)
+    assert once.kind == "tuple of 2" and list(twice.outputs) == ["0.0", "0.1", "1.0", "1.1"]
+    assert once.outputs["0"].tolist() == twice.outputs["0.0"].tolist() != twice.outputs["1.0"].tolist()
+
+
+def test_an_endless_iterator_ends():
+    def endless():
+        while True:
+            yield 1.0
+
+    assert len(observe(endless, {}).outputs) == 10_000
+
+
+def test_arguments_can_be_looked_at_after_the_call():
+    def halve(target, online):
+        for one in target:
+            one.mul_(0.5)
+
+    arguments = {"target": [np.ones(2), np.zeros(1)], "online": [np.ones(2), np.zeros(1)]}
+    seen = observe(halve, arguments, returns=["target"])
+    assert seen.outputs["0"].tolist() == [0.5, 0.5] and seen.mutated == []
+    assert observe(halve, arguments).mutated == ["target"]
+
+
+def test_what_is_built_is_built_anew_for_every_observation():
+    def step(envs, actions):
+        return torch.as_tensor(envs.step(actions.numpy())[0])
+
+    arguments = {"envs": built("envs.ChainVectorEnv", num_envs=2, slip=0.0), "actions": np.array([1, 0])}
+    assert observe(step, arguments).outputs[""].tolist() == observe(step, arguments).outputs[""].tolist()
