@@ -8,5 +8,52 @@ judged function, so it cannot be forged; it raises ValueError for outputs that i
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
+
 READABLE = "result"
 """The kind of every observation that a view could read."""
+
+
+def episode_split(arguments: dict[str, Any], outputs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What every right split by episodes has in common: all counts are 0 and nothing is too many or too few.
+
+    `arguments` has episode_ids (M,) and fraction; `outputs` is (train, held_out), two masks over the steps. Of the episodes that
+    straddle the two sides, 2 stands for more than one.
+    """
+    train, held_out = _masks(outputs, ("0", "1"), len(arguments["episode_ids"]))
+    ids = arguments["episode_ids"]
+    episodes, lost, held = (len(np.unique(ids[mask])) for mask in (train | held_out, ~train & ~held_out, held_out))
+    straddling = len(np.intersect1d(ids[train & ~held_out], ids[held_out & ~train]))
+    wanted = arguments["fraction"] * len(np.unique(ids))
+    return {
+        "episodes on both sides": np.array(min(straddling, 2)),
+        "steps on neither side": np.array(lost > 0),
+        "steps in both masks": np.array(bool((train & held_out).any())),
+        "held-out episodes, too many": np.array(held > wanted + 1),
+        "held-out episodes, too few": np.array(held < wanted - 1),
+        "a side is empty": np.array(not train.any() or not held_out.any()),
+        "episodes in all": np.array(episodes),
+    }
+
+
+def two_splits(arguments: dict[str, Any], outputs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Whether two splits in a row, with one generator, differ."""
+    masks = _masks(outputs, ("0.0", "0.1", "1.0", "1.1"), len(arguments["episode_ids"]))
+    return {"the same episodes twice": np.array(bool((masks[1] == masks[3]).all()))}
+
+
+def training_curve(_arguments: dict[str, Any], outputs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Of a training run's losses: how many there are, the first, and the mean of the last tenth."""
+    losses = outputs.get("")
+    if losses is None or losses.ndim != 1 or not len(losses) or losses.dtype.kind != "f":
+        raise ValueError("the losses must be a tensor of numbers, one for each step")
+    return {"number of losses": np.array(len(losses)), "first loss": losses[0], "last losses": losses[-max(len(losses) // 10, 1) :].mean()}
+
+
+def _masks(outputs: dict[str, np.ndarray], paths: tuple[str, ...], size: int) -> list[np.ndarray]:
+    masks = [outputs.get(path) for path in paths]
+    if len(outputs) != len(paths) or any(mask is None or mask.dtype != bool or mask.shape != (size,) for mask in masks):
+        raise ValueError("train and held_out must be bool masks over the steps")
+    return [mask for mask in masks if mask is not None]

@@ -27,7 +27,7 @@ def collect_demonstrations(policy, env, num_episodes, seed):
       from 0; returns (E,) float32, undiscounted.
     Raises: ValueError if num_episodes < 1.
     """
-    validate.positive_count(num_episodes=num_episodes)
+    validate.at_least_one(num_episodes=num_episodes)
     obs_rows, action_rows, episode_ids, returns = [], [], [], []
     for episode in range(num_episodes):
         obs, _ = env.reset(seed=seed + episode)
@@ -130,9 +130,8 @@ def train_bc(network, loss_fn, obs, actions, num_steps=1000, batch_size=128, lea
     Returns: (num_steps,) tensor without a graph: each minibatch's loss before its step.
     Raises: ValueError if obs and actions differ in their number of rows, or num_steps < 1.
     """
-    validate.positive_count(num_steps=num_steps)
-    if len(obs) != len(actions):
-        raise ValueError(f"obs and actions must have as many rows as each other, got {len(obs)} and {len(actions)}")
+    validate.at_least_one(num_steps=num_steps)
+    validate.same_length(obs=obs, actions=actions)
     optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate)
     losses = []
     for _ in range(num_steps):
@@ -204,10 +203,6 @@ def repaired_pairs(obs, actions, episode_ids):
       for all steps of which the log holds both, in their order.
     Raises: ValueError if the three differ in their number of rows.
     """
-    if not len(obs) == len(actions) == len(episode_ids):
-        raise ValueError(
-            f"obs, actions and episode_ids must have as many rows as each other, "
-            f"got {len(obs)}, {len(actions)} and {len(episode_ids)}"
-        )
+    validate.same_length(obs=obs, actions=actions, episode_ids=episode_ids)
     same_episode = episode_ids[1:] == episode_ids[:-1]
     return obs[:-1][same_episode], actions[1:][same_episode]
