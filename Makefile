@@ -1,6 +1,6 @@
 # make book    build book/_build/html/index.html          make test   all tests (installs Chromium and bubblewrap if it may)
 # make release write the students' bundle into release/   make check  style, types and the quick tests
-# make bench   how fast the grader is, beside stock nbgrader
+# make bench   how fast the grader is, beside stock nbgrader, and PPO, beside Stable-Baselines3 (which it installs)
 # The environment is .venv; it is brought up to date whenever the pins or pyproject.toml change.
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
@@ -30,7 +30,9 @@ check: install
 	$(BIN)/python -m pytest -q $(QUICK)
 
 bench: install
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[bench]'
 	$(BIN)/python tools/bench_grading.py
+	$(BIN)/python tools/bench_ppo.py
 
 install: $(INSTALLED)
 

@@ -33,7 +33,7 @@ import yaml
 from autograder import assemble
 from autograder.chapter import Chapter, all_chapters
 from autograder.execution import BookError, cache_folder, code_inputs, content_hash, executed_outputs, replace_cached
-from autograder.paths import COURSE_LIB, ROOT
+from autograder.paths import COURSE_LIB, ROOT, RUNS
 
 BOOK = ROOT / "book"
 STAGE = BOOK / "_stage"
@@ -155,7 +155,7 @@ def kill_matrix_page(matrix: dict[str, list[dict]]) -> str:
 def kill_rows(chapter: Chapter) -> list[dict]:
     """The chapter's kill matrix, a dict for each exercise, computed on all cores once for each state of what takes part."""
     library = [COURSE_LIB / f"{module}.py" for module in JUDGING]
-    own = [path for path in code_inputs(chapter.assignment) if COURSE_LIB not in path.parents]
+    own = [path for path in code_inputs(chapter) if not {COURSE_LIB, RUNS} & set(path.parents)]
     cached = (
         cache_folder() / f"{chapter.assignment}-{content_hash([], [*library, *own, ROOT / 'autograder' / 'killmatrix.py'])}.json"
     )
@@ -257,7 +257,7 @@ def _build_key(chapters: list[Chapter], with_solutions: bool) -> str:
     """A hash of all inputs of a build: texts, code, this builder, the pins, the configuration."""
     own = [path for path in BOOK.rglob("*") if path.is_file() and not path.relative_to(BOOK).parts[0].startswith("_")]
     builder = [*(ROOT / "autograder").glob("*.py"), ROOT / "_config.yml"]
-    inputs = [path for chapter in chapters for path in [chapter.path, *code_inputs(chapter.assignment)]]
+    inputs = [path for chapter in chapters for path in [chapter.path, *code_inputs(chapter)]]
     return content_hash([str(with_solutions)], [*own, *builder, *inputs])
 
 

@@ -19,6 +19,7 @@ from autograder import paths
 ANSWER_LINE = "*Write your answer here.*"
 
 _FRONT_MATTER = {"chapter": int, "title": str, "minutes": int, "prerequisites": list, "builds": str, "summary": str}
+_OPTIONAL = {"experiments": list}
 _ABOUT_THE_FORMAT = {"jupytext", "kernelspec", "jupyter", "source_map"}
 _OPTIONS = {"tags": list, "exercise": str, "difficulty": int, "minutes": int, "alt": str}
 _QUESTION = {"open_question": str, "points": (int, float)}
@@ -63,6 +64,7 @@ class Chapter:
     builds: str
     summary: str
     cells: tuple[Cell, ...]
+    experiments: tuple[str, ...] = ()  # whose records its pages load
 
     @property
     def assignment(self) -> str:
@@ -119,7 +121,7 @@ def parse(path: Path) -> Chapter:
     except (MystMetadataParsingError, yaml.YAMLError) as error:
         raise ChapterError(path, 1, f"unreadable options: {error}") from error
     front = {key: value for key, value in notebook.metadata.items() if key not in _ABOUT_THE_FORMAT}
-    _expect(path, 1, "front matter", front, _FRONT_MATTER, required=set(_FRONT_MATTER))
+    _expect(path, 1, "front matter", front, _FRONT_MATTER | _OPTIONAL, required=set(_FRONT_MATTER))
     if not path.name.startswith(f"ch{front['chapter']}_"):
         raise ChapterError(path, 1, f"chapter {front['chapter']} must lie in a file called ch{front['chapter']}_*.md")
     lines = text.splitlines()
@@ -134,6 +136,7 @@ def parse(path: Path) -> Chapter:
         front["builds"],
         front["summary"],
         cells,
+        tuple(front.get("experiments", ())),
     )
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 if TYPE_CHECKING:
     from autograder.assemble import Outputs
@@ -133,6 +133,70 @@ def grade(
     low = [v for v in results if fail_under and (v.score < fail_under * v.max_score or not v.max_score)]
     if low:
         _stop(f"{len(low)} of {len(results)} submissions score under {fail_under:.0%}", LOW_SCORES)
+
+
+@app.command()
+def experiment(
+    name: Annotated[str | None, typer.Argument(help="The experiment; without it, all are listed with their state.")] = None,
+    seeds: Annotated[
+        int | None, typer.Option(min=1, help="Seeds 0 to N - 1 of each variant; the experiment's own number by default.")
+    ] = None,
+    variant: Annotated[list[str] | None, typer.Option(help="Make this variant only; may be repeated.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Runs at a time, one core each.")] = os.cpu_count() or 1,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler, tcp://…, instead of --jobs.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Where the records go: experiments/runs by default.")] = None,
+) -> None:
+    """Make the records of long runs that are missing. Killed, it loses nothing: run it again. Exit status 3 if a run failed."""
+    from collections import Counter
+
+    from experiments import runner
+
+    folder = out or runner.RUNS
+    if name is None:
+        print("\n".join(_state(one, folder) for one in runner.names()))
+        return
+    try:
+        todo = runner.tasks(runner.definition(name), variant or (), seeds, folder)
+    except runner.ExperimentError as error:
+        _stop(error)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    outcomes = []
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+        whole = bar.add_task(name, total=len(todo))
+        bars: dict[tuple[str, int], TaskID] = {}
+
+        def show(variant: str, seed: int, done: int, total: int) -> None:
+            if (variant, seed) not in bars:
+                bars[variant, seed] = bar.add_task(f"{variant}-{seed}")
+            bar.update(bars[variant, seed], completed=done, total=total)
+
+        try:
+            for outcome in runner.make(todo, jobs, scheduler, show):
+                outcomes.append(outcome)
+                bar.advance(whole)
+                if (outcome.variant, outcome.seed) in bars:
+                    bar.update(bars[outcome.variant, outcome.seed], visible=False)
+                if outcome.state == "failed":
+                    err.print(f"{outcome.variant}-{outcome.seed}: {outcome.error}", markup=False)
+        except OSError as error:  # no scheduler there, or a full disk
+            bar.stop()
+            _stop(error, BROKEN)
+    ends = Counter(outcome.state for outcome in outcomes)
+    print(f"{name}: {', '.join(f'{count} {end}' for end, count in sorted(ends.items()))}. The records are in {folder / name}")
+    if ends["failed"]:
+        _stop("some runs failed: run again when that is mended; what is finished is kept", BROKEN)
+
+
+def _state(name: str, folder: Path) -> str:
+    """One experiment in a few lines: what it measures, and how many of its runs have a record."""
+    from collections import Counter
+
+    from experiments import runner
+
+    module = runner.definition(name)
+    found = Counter(runner.state(task) for task in runner.tasks(module, out=folder))
+    counts = ", ".join(f"{count} {kind}" for kind, count in sorted(found.items()))
+    return f"{name}: {(module.__doc__ or '').strip().splitlines()[0]}\n    {counts}"
 
 
 @app.command()

@@ -26,7 +26,7 @@ from nbformat import NotebookNode
 from nbformat.v4 import new_code_cell, new_notebook
 
 from autograder.chapter import Cell, Chapter
-from autograder.paths import COURSE_LIB, ROOT
+from autograder.paths import COURSE_LIB, ROOT, RUNS
 from course_lib.chapters import REFERENCES
 
 CELL_TIMEOUT = 300  # seconds; a page's cells together should need at most 60
@@ -48,15 +48,18 @@ def executed_outputs(chapter: Chapter) -> list[list[NotebookNode]]:
 
 
 def execution_key(chapter: Chapter) -> str:
-    """A hash of all that can change a chapter's outputs: its code, the library, the references, its checks, the pins."""
-    return content_hash([_source(chapter, cell) for cell in _code_cells(chapter)], code_inputs(chapter.assignment))
+    """A hash of all that can change a chapter's outputs: its code, the library, the references, its checks, its records, the pins."""
+    return content_hash([_source(chapter, cell) for cell in _code_cells(chapter)], code_inputs(chapter))
 
 
-def code_inputs(assignment: str) -> list[Path]:
+def code_inputs(chapter: Chapter) -> list[Path]:
     """The files outside the chapter that its outputs depend on."""
-    library = [path for path in COURSE_LIB.rglob("*") if path.is_file() and not {"frozen", "__pycache__"} & set(path.parts)]
-    checks = [ROOT / "autograder" / name for name in ("spec.py", "freeze.py", f"checks/{assignment}.py")]
-    return [*library, *(ROOT / "solutions").glob("*.py"), *checks, ROOT / "requirements.txt", ROOT / "constraints.txt"]
+    library = [
+        path for path in COURSE_LIB.rglob("*") if path.is_file() and not {"frozen", "runs", "__pycache__"} & set(path.parts)
+    ]
+    checks = [ROOT / "autograder" / name for name in ("spec.py", "freeze.py", f"checks/{chapter.assignment}.py")]
+    recorded = [path for name in chapter.experiments for path in (RUNS / name).glob("[!.]*")]
+    return [*library, *recorded, *(ROOT / "solutions").glob("*.py"), *checks, ROOT / "requirements.txt", ROOT / "constraints.txt"]
 
 
 def content_hash(texts: Iterable[str], files: Iterable[Path]) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 CHAPTERS = ROOT / "chapters"
 COURSE_LIB = ROOT / "course_lib"
+RUNS = ROOT / "experiments" / "runs"
 REFERENCES = ROOT / "book" / "references.bib"
 
 

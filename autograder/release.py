@@ -26,7 +26,8 @@ from autograder.chapter import ANSWER_LINE, Chapter
 from autograder.contract import STUB, Sources
 from autograder.contract import sources as real_sources
 
-LEARNERS_NEED = {"torch", "numpy", "matplotlib", "ipywidgets", "gymnasium", "safetensors", "tqdm"}
+LEARNERS_NEED = {"torch", "numpy", "matplotlib", "ipywidgets", "gymnasium", "safetensors", "pyarrow", "tqdm"}
+RECORDED = {".parquet", ".mp4", ".webp"}  # not policies: one could be handed in
 MANIFEST = ".release.json"
 
 Recorded = Callable[[Chapter], assemble.Outputs | None]
@@ -64,7 +65,8 @@ def release(
             say(f"{out / name} has somebody's work in it and was left as it is; the new notebook is {place}")
         _write(place, content)
     for name in before["library"]:
-        if name not in support and "/frozen/" not in name:  # checks of chapters released earlier are still needed
+        kept = "/frozen/" in name or "/runs/" in name  # checks and records of chapters released earlier are still needed
+        if name not in support and not kept:
             (out / name).unlink(missing_ok=True)
     for name, content in support.items():
         _write(out / name, content)
@@ -97,17 +99,24 @@ def _chosen(only: Iterable[str] | None, directory: Path | None) -> list[Chapter]
 
 
 def _library(chosen: list[Chapter], sources: Callable[[Chapter], Sources]) -> dict[str, bytes]:
-    """An installable copy of course_lib, with the frozen checks of the chosen chapters."""
+    """An installable copy of course_lib, with the frozen checks and the records of long runs of the chosen chapters."""
     files = {"course_lib/pyproject.toml": _pyproject().encode()}
     for path in sorted(paths.COURSE_LIB.rglob("*")):
         inside = path.relative_to(paths.COURSE_LIB)
-        if path.is_file() and inside.parts[0] != "frozen" and "__pycache__" not in inside.parts:
+        if path.is_file() and inside.parts[0] not in ("frozen", "runs") and "__pycache__" not in inside.parts:
             files[f"course_lib/course_lib/{inside.as_posix()}"] = path.read_bytes()
     with tempfile.TemporaryDirectory() as folder:
         for chapter in chosen:
             freeze.write(sources(chapter).exercises, Path(folder))
         for path in sorted(Path(folder).iterdir()):
             files[f"course_lib/course_lib/frozen/{path.name}"] = path.read_bytes()
+    for name in sorted({name for chapter in chosen for name in chapter.experiments}):
+        recorded = sorted(path for path in (paths.RUNS / name).glob("[!.]*") if path.suffix in RECORDED)
+        if not recorded:
+            raise ValueError(
+                f"there are no records of the experiment {name!r} in {paths.RUNS}: `course experiment {name}` makes them"
+            )
+        files |= {f"course_lib/course_lib/runs/{name}/{path.name}": path.read_bytes() for path in recorded}
     return files
 
 

@@ -11,6 +11,74 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 
+def make(name, num_envs, **env_kwargs):
+    """N copies of a Gymnasium environment, stepped one after another in this process, with same-step autoreset.
+
+    Where an episode ends, `step` returns the first observation of the next one, and the true last observation is in
+    `info["final_obs"]`. Nothing is drawn (`render_mode=None`) unless asked for: drawing costs more than the physics.
+
+    Args:
+      name: the environment's id, such as "LunarLanderContinuous-v3".
+      num_envs: N.
+      env_kwargs: passed on to the environment's constructor; `max_episode_steps` sets its time limit.
+    """
+    options = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    env_kwargs = {"render_mode": None, **env_kwargs}
+    return gym.make_vec(name, num_envs, vectorization_mode="sync", vector_kwargs=options, **env_kwargs)
+
+
+class TimerVectorEnv(gym.vector.VectorEnv):
+    """Episodes of fixed lengths, and a reward of 1 a step: every value and advantage can be worked out by hand.
+
+    Environment i ends its episodes after `lengths[i]` steps, by *termination* where `terminates[i]`, else by *truncation*. What it
+    shows is the number of steps since the episode's start. Beside the 1, the reward has `action_reward` times the sum of the
+    action's components. Nothing is random. Same-step autoreset, as in ChainVectorEnv.
+
+    Args:
+      lengths: steps of an episode, one number for each of the N environments, at least 1.
+      terminates: whether the task ends then, or only the recording; one bool for each environment.
+      action_reward: what an action of 1 pays, in units of reward.
+
+    Observations: (N, 1) float32. Actions: (N, 1) float32 in [-1, 1].
+    Raises: ValueError if lengths and terminates differ in number, or a length is less than 1.
+    """
+
+    def __init__(self, lengths=(3, 3), terminates=(True, False), action_reward=0.0):
+        self.lengths, self.terminates = np.asarray(lengths, dtype=int), np.asarray(terminates, dtype=bool)
+        if self.lengths.shape != self.terminates.shape:
+            raise ValueError(f"lengths and terminates must be of one length, got {lengths} and {terminates}")
+        if (self.lengths < 1).any():
+            raise ValueError(f"lengths must be at least 1, got {lengths}")
+        self.num_envs, self.action_reward = len(self.lengths), action_reward
+        self.single_observation_space = gym.spaces.Box(0.0, np.inf, (1,), np.float32)
+        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        self.elapsed = np.zeros(self.num_envs, dtype=int)
+
+    def observe(self):
+        """The steps since the episodes' starts, (N, 1)."""
+        return self.elapsed[:, None].astype(np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        """Start all episodes."""
+        super().reset(seed=seed)
+        self.elapsed[:] = 0
+        return self.observe(), {}
+
+    def step(self, actions):
+        """Let a step pass; see the class for what ends an episode."""
+        self.elapsed += 1
+        rewards = 1 + self.action_reward * np.asarray(actions).sum(-1)
+        ended = self.elapsed == self.lengths
+        info = {}
+        if ended.any():
+            info = {"final_obs": self.observe(), "_final_obs": ended}
+            self.elapsed = np.where(ended, 0, self.elapsed)
+        return self.observe(), rewards, ended & self.terminates, ended & ~self.terminates, info
+
+
 class ChainVectorEnv(gym.vector.VectorEnv):
     """A row of cells: a one-off payment at the left end, a steady wage at the right end.
 

@@ -45,15 +45,21 @@ def use_style():
         set_matplotlib_formats("svg")
 
 
-def curves(ax, x, runs):
+def curves(ax, x, runs, xlabel="", ylabel=""):
     """Draw, for every entry of `runs`, the interquartile mean over seeds and its 95% bootstrap interval.
+
+    `x, runs = records.curves("mean_return", labels)` gives those of recorded runs.
 
     Args:
       ax: matplotlib axes.
       x: (points,), shared by all curves.
       runs: label -> scores of shape (seeds, points).
+      xlabel, ylabel: labels of the axes; with either of them a legend is drawn, too.
     """
     for label, scores in runs.items():
         centre, low, high = summarise(scores)
         (line,) = ax.plot(x, centre, label=label)
         ax.fill_between(x, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
+    if xlabel or ylabel:
+        ax.set(xlabel=xlabel, ylabel=ylabel)
+        ax.legend()

@@ -19,6 +19,16 @@ class Rollout:
     next_obs: torch.Tensor  # (T, N, *obs)
     terminated: torch.Tensor  # (T, N) bool
     truncated: torch.Tensor  # (T, N) bool
+    last_obs: torch.Tensor  # (N, *obs), what the environments show now: where the next rollout starts
+
+
+def require_same_step_autoreset(envs):
+    """Raise ValueError unless `envs` starts the next episode in the same step in which one ends."""
+    mode = envs.metadata.get("autoreset_mode")
+    if mode != AutoresetMode.SAME_STEP:
+        raise ValueError(
+            f"envs must use same-step autoreset, got {mode}: make the vector environment with AutoresetMode.SAME_STEP"
+        )
 
 
 def true_next_obs(obs, info):
@@ -49,11 +59,7 @@ def collect(envs, policy, num_steps, obs):
     Raises: ValueError if envs resets in another way than in the same step: with Gymnasium's default (next-step) every end of an
       episode is followed by a transition that never happened.
     """
-    mode = envs.metadata.get("autoreset_mode")
-    if mode != AutoresetMode.SAME_STEP:
-        raise ValueError(
-            f"envs must use same-step autoreset, got {mode}: make the vector environment with AutoresetMode.SAME_STEP"
-        )
+    require_same_step_autoreset(envs)
     columns = []
     for _ in range(num_steps):
         before = torch.as_tensor(obs, dtype=torch.float32)
@@ -69,5 +75,23 @@ def collect(envs, policy, num_steps, obs):
         next_obs=torch.as_tensor(np.stack(successors), dtype=torch.float32),
         terminated=torch.as_tensor(np.stack(ends)),
         truncated=torch.as_tensor(np.stack(cuts)),
+        last_obs=torch.as_tensor(obs, dtype=torch.float32),
     )
     return rollout, obs
+
+
+class EpisodeReturns:
+    """The undiscounted returns of episodes that run across the borders of rollouts."""
+
+    def __init__(self, num_envs):
+        self.running = np.zeros(num_envs)
+
+    def add(self, rollout):
+        """The returns, in the order of their ends, of the episodes that ended in `rollout`, the next one in time: list of floats."""
+        finished = []
+        for rewards, ended in zip(rollout.rewards.numpy(), (rollout.terminated | rollout.truncated).numpy(), strict=True):
+            self.running += rewards
+            if ended.any():
+                finished += self.running[ended].tolist()
+                self.running[ended] = 0
+        return finished

@@ -17,14 +17,46 @@ def summarise(scores, confidence=0.95, num_resamples=1000, seed=0):
     """Interquartile mean over seeds, with a percentile bootstrap interval.
 
     Args:
-      scores: (seeds, ...), one row for each seed; summarised separately at every other position.
+      scores: (seeds, ...), one row for each seed; summarised separately at every other position. Or a list of such arrays, one
+        for each task: the mean is over all of them together, and seeds are resampled within each (a stratified bootstrap).
       confidence: mass of the interval, in (0, 1).
       num_resamples: bootstrap samples of the seeds.
       seed: of the resampling, so that a figure is the same whenever it is drawn.
 
     Returns: (centre, low, high), each of shape (...).
     """
-    scores = np.asarray(scores, dtype=float)
-    picks = np.random.default_rng(seed).integers(len(scores), size=(len(scores), num_resamples))
-    low, high = np.quantile(middle_mean(scores[picks]), [(1 - confidence) / 2, (1 + confidence) / 2], axis=0)
-    return middle_mean(scores), low, high
+    tasks = [np.asarray(task, dtype=float) for task in (scores if isinstance(scores, list | tuple) else [scores])]
+    tasks = tasks if tasks[0].ndim else [np.array(tasks)]  # a list of numbers is one task
+    generator = np.random.default_rng(seed)
+    picks = [task[generator.integers(len(task), size=(len(task), num_resamples))] for task in tasks]
+    resampled = middle_mean(np.concatenate(picks))
+    low, high = np.quantile(resampled, [(1 - confidence) / 2, (1 + confidence) / 2], axis=0)
+    return middle_mean(np.concatenate(tasks)), low, high
+
+
+def interval(scores, digits=0):
+    """The summary of scores (seeds,) in one text: "265 [251, 272]", the interquartile mean and its 95% interval."""
+    centre, low, high = summarise(scores)
+    return f"{centre:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def table(rows, digits=0):
+    """Lines of aligned text, one for each row: a label, and under each column the summary of its scores.
+
+    Args:
+      rows: label -> {column: scores (seeds,)}, the same columns in every row; a text is shown as it is.
+      digits: after the decimal point, for all columns, or column -> digits.
+
+    Returns: text for `print`, with the columns' names in the first line.
+    """
+    columns = list(next(iter(rows.values())))
+    digits = digits if isinstance(digits, dict) else dict.fromkeys(columns, digits)
+    lines = [["", *columns]]
+    for label, cells in rows.items():
+        texts = [cells[name] if isinstance(cells[name], str) else interval(cells[name], digits.get(name, 0)) for name in columns]
+        lines.append([label, *texts])
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join(
+        "  ".join([line[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(line[1:], widths[1:], strict=True))])
+        for line in lines
+    )

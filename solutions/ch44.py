@@ -88,7 +88,7 @@ def normalize_advantages(advantages, eps=1e-8):
 
         (A - mean(A)) / (std(A) + ε)
 
-    Andrychowicz et al. (2021), section 3.5, https://arxiv.org/abs/2006.05990
+    Andrychowicz et al. (2021), section 3.3, https://arxiv.org/abs/2006.05990
 
     Args:
       advantages: any shape, at least two elements.

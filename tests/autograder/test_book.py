@@ -66,6 +66,15 @@ def test_code_runs_again_after_a_change_of(name, tiny, elsewhere):
     assert execution.execution_key(tiny.chapter) != key
 
 
+def test_a_new_record_of_a_chapters_experiment_runs_it_again(tiny, elsewhere, tmp_path, monkeypatch):
+    monkeypatch.setattr(execution, "RUNS", tmp_path)
+    page = dataclasses.replace(tiny.chapter, experiments=("toy",))
+    key = execution.execution_key(page)
+    (tmp_path / "toy").mkdir()
+    (tmp_path / "toy" / "a-0.parquet").write_bytes(b"a record")
+    assert execution.execution_key(page) != key
+
+
 def test_generated_checks_do_not_count_as_a_change(tiny, elsewhere):
     key = execution.execution_key(tiny.chapter)
     (elsewhere / "course_lib/frozen/case.npz").write_text("second\n")

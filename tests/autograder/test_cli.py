@@ -79,3 +79,32 @@ def test_what_is_no_notebook_cannot_be_checked(tmp_path):
     assert run("check", tmp_path / "none.ipynb").exit_code == 2
     (tmp_path / "empty.ipynb").write_text(str(new_notebook()).replace("'", '"'))
     assert run("check", tmp_path / "empty.ipynb").exit_code == 2
+
+
+TOY = '''"""A toy: one step."""
+VARIANTS = {"a": {}, "b": {}}
+SEEDS = 2
+
+
+def run(variant, seed, checkpoint_dir, report):
+    if variant == "b":
+        raise RuntimeError("b fails")
+    return [{"env_steps": 0, "score": 1.0}]
+'''
+
+
+def test_long_runs_are_made_listed_and_kept(tmp_path, monkeypatch):
+    from experiments import runner
+
+    (tmp_path / "toy.py").write_text(TOY)
+    monkeypatch.setattr(runner, "FOLDER", tmp_path)
+    out = tmp_path / "runs"
+    made = run("experiment", "toy", "--variant", "a", "--seeds", "1", "--out", out)
+    assert made.exit_code == 0 and "toy: 1 made. The records are in" in made.output
+    assert (out / "toy" / "a-0.parquet").is_file()
+    listed = run("experiment", "--out", out)
+    assert listed.exit_code == 0 and "toy: A toy: one step.\n    1 finished, 3 missing" in listed.output
+    failing = run("experiment", "toy", "--out", out)
+    assert failing.exit_code == 3 and "toy: 2 failed, 1 kept, 1 made." in failing.output and "b fails" in failing.output
+    assert run("experiment", "tow").exit_code == 2 and "there are: toy" in run("experiment", "tow").output
+    assert run("experiment", "toy", "--variant", "c").exit_code == 2

@@ -1,4 +1,6 @@
+import dataclasses
 import json
+import os
 import re
 import subprocess
 import sys
@@ -70,6 +72,30 @@ def test_a_later_release_of_another_chapter_keeps_the_checks_of_the_first_in_the
     assert "course_lib/course_lib/frozen/double.npz" in _files(_release(tiny, tmp_path, ["ch98"]))
     with zipfile.ZipFile(tmp_path / "course.zip") as archive:
         assert not [name for name in archive.namelist() if "/frozen/" in name]
+
+
+def test_records_of_long_runs_are_put_beside_the_library_but_no_policies(tiny, tmp_path, monkeypatch):
+    from autograder import chapter, paths
+    from course_lib import records
+
+    monkeypatch.setattr(paths, "RUNS", tmp_path / "runs")
+    page = dataclasses.replace(chapter.load("ch98", tiny.directory), experiments=("toy",))
+    monkeypatch.setattr(release, "_chosen", lambda only, directory: [page])
+    with pytest.raises(ValueError, match=r"no records of the experiment 'toy' .*`course experiment toy` makes them"):
+        _release(tiny, tmp_path / "bundle")
+    made = {"variant": "a", "seed": 0, "configuration": {}, "summary": {}}
+    records.write(tmp_path / "runs" / "toy" / "a-0.parquet", [{"env_steps": 0, "score": 4.0}], made)
+    for name in ("a-0.safetensors", "a-0.mp4", ".writing-x.mp4"):
+        (tmp_path / "runs" / "toy" / name).write_bytes(b"content")
+    bundle = _release(tiny, tmp_path / "bundle")
+    library = bundle / "course_lib" / "course_lib"
+    assert {path.name for path in (library / "runs" / "toy").iterdir()} == {"a-0.parquet", "a-0.mp4"}
+    program = "from course_lib import records; print(records.load('toy').final('a', 'score'))"
+    environment = {**os.environ, "PYTHONPATH": str(library.parent)}
+    shown = subprocess.run(
+        [sys.executable, "-c", program], env=environment, cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert shown.stdout == "[4.]\n"
 
 
 def test_an_unknown_chapter_is_refused_before_anything_is_written(tiny, tmp_path):

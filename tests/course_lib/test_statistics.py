@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from course_lib.statistics import middle_mean, summarise
+from course_lib.statistics import interval, middle_mean, summarise, table
 
 
 def test_middle_mean_drops_a_quarter_at_each_end():
@@ -29,3 +29,25 @@ def test_equal_scores_have_an_interval_of_no_width():
 def test_summarise_is_reproducible():
     scores = np.arange(10.0)
     assert summarise(scores) == summarise(scores)
+
+
+def test_a_list_of_numbers_is_one_task():
+    assert summarise([1.0, 2.0, 5.0, 9.0]) == summarise(np.array([1.0, 2.0, 5.0, 9.0]))
+
+
+def test_tasks_are_resampled_apart():
+    # each task's seeds agree: resampled within the tasks nothing varies, resampled over all of them it would
+    centre, low, high = summarise([np.full(4, 0.0), np.full(4, 8.0)])
+    assert (centre, low, high) == pytest.approx((4, 4, 4))
+    _, low, high = summarise(np.array([0.0] * 4 + [8.0] * 4))
+    assert low < 4 < high
+
+
+def test_tables_are_aligned():
+    rows = {"ours": {"return": np.full(5, 250.0), "KL": np.full(5, 0.01)}, "no clip": {"return": np.full(5, 30.0), "KL": "none"}}
+    assert interval(np.full(5, 2.5), 1) == "2.5 [2.5, 2.5]"
+    assert table(rows, {"KL": 2}).splitlines() == [
+        "                 return                 KL",
+        "ours      250 [250, 250]  0.01 [0.01, 0.01]",
+        "no clip      30 [30, 30]               none",
+    ]

@@ -1,0 +1,1 @@
+"""Long runs: a module for each experiment, the engine that makes them (`course experiment`), and their records in runs/."""

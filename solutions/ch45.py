@@ -1,0 +1,362 @@
+"""Reference solutions of chapter 45: PPO, from the log-probability of an action to an agent that lands."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+import torch
+
+from course_lib import validate
+from course_lib.policies import Adam, Categorical, policy_for
+from course_lib.ppo import Batch
+from course_lib.rollouts import EpisodeReturns, Rollout, require_same_step_autoreset, true_next_obs
+from course_lib.seeding import seed_everything
+from solutions.ch44 import compute_gae, explained_variance, lambda_returns, normalize_advantages
+
+
+def gaussian_log_prob(mean, log_std, actions):
+    """Log-density of actions under independent normal distributions, one for each component.
+
+        log π(a|s) = -Σ_i [ (a_i - μ_i)² / (2 σ_i²) + log σ_i + ½ log 2π ],   σ = exp(log_std)
+
+    Args:
+      mean: μ(s); (B, A). Receives gradient.
+      log_std: log σ, the same in every state, (A,), or one for each, (B, A). Receives
+        gradient.
+      actions: as sampled, before clipping to the bounds; (B, A). No gradient.
+
+    Returns: (B,) nats, summed over the components.
+    Raises: ValueError if the shapes of mean and actions differ, or log_std is neither (A,)
+      nor (B, A).
+    """
+    validate.same_shape(mean=mean, actions=actions)
+    validate.same_shape(mean=mean, log_std=log_std.expand_as(mean) if log_std.shape == mean.shape[-1:] else log_std)
+    scaled = (actions.detach() - mean) * (-log_std).exp()
+    return -(0.5 * scaled.square() + log_std + 0.5 * math.log(2 * math.pi)).sum(-1)
+
+
+def gaussian_entropy(log_std):
+    """Differential entropy of independent normal distributions, one for each component.
+
+        H = Σ_i [ log σ_i + ½ log 2πe ],   σ = exp(log_std)
+
+    Unlike the entropy of discrete actions it may be negative.
+
+    Args:
+      log_std: log σ; (A,) or (B, A). Receives gradient.
+
+    Returns: nats, summed over the components: () for (A,), (B,) for (B, A).
+    """
+    return (log_std + 0.5 * math.log(2 * math.pi * math.e)).sum(-1)
+
+
+def evaluate_actions(policy, obs, actions):
+    """What a policy now thinks of actions: their log-probabilities, its entropy, and values.
+
+    Args:
+      policy: called with obs, returns (Gaussian or Categorical, values).
+      obs: (B, *obs).
+      actions: (B, A) for a Gaussian; (B,) whole numbers for a Categorical.
+
+    Returns: (log_probs (B,), entropy (B,) or (), values (B,)), all with a graph.
+    """
+    distribution, values = policy(obs)
+    if isinstance(distribution, Categorical):
+        log_probs = distribution.logits.log_softmax(-1)
+        chosen = log_probs.gather(-1, actions.long().unsqueeze(-1)).squeeze(-1)
+        return chosen, -(log_probs.exp() * log_probs).sum(-1), values
+    log_probs = gaussian_log_prob(distribution.mean, distribution.log_std, actions)
+    return log_probs, gaussian_entropy(distribution.log_std), values
+
+
+def collect_rollout(envs, policy, num_steps, obs, generator):
+    """Step every environment `num_steps` times with sampled actions.
+
+    The actions that are recorded are those that were sampled; the environments get them
+    clipped to the bounds of their action space.
+
+    Args:
+      envs: a vector environment of N environments with same-step autoreset.
+      policy: `policy.act(obs, generator)` samples actions (N, *act) for obs (N, *obs).
+      num_steps: T.
+      obs: (N, *obs), what the environments show now: from `envs.reset`, or `last_obs` of
+        the rollout before.
+      generator: torch generator, the only source of the actions' randomness.
+
+    Returns: Rollout of (T, N) steps, float32; `next_obs` is the true successor of each
+      step, also where an episode ends; `last_obs` is what the environments show
+      afterwards.
+    Raises: ValueError if envs resets in another way than in the same step.
+    """
+    require_same_step_autoreset(envs)
+    bounds = envs.single_action_space
+    steps = []
+    for _ in range(num_steps):
+        before = torch.as_tensor(obs, dtype=torch.float32)
+        actions = policy.act(before, generator)
+        clipped = actions.numpy() if actions.dtype == torch.int64 else actions.numpy().clip(bounds.low, bounds.high)
+        obs, rewards, terminated, truncated, info = envs.step(clipped)
+        steps.append((before, actions, rewards, true_next_obs(obs, info), terminated, truncated))
+    columns = [torch.as_tensor(np.stack(column)) for column in zip(*steps, strict=True)]
+    columns = [column.float() if column.is_floating_point() else column for column in columns]
+    return Rollout(*columns, torch.as_tensor(obs, dtype=torch.float32))
+
+
+def minibatches(batch_size, minibatch_size, generator):
+    """The minibatches of one epoch: every index once, in a fresh random order.
+
+    Args:
+      batch_size: number of samples, at least 1.
+      minibatch_size: samples in a minibatch, at least 1; the last one may be shorter.
+      generator: torch generator, the only source of the order.
+
+    Returns: iterator of int64 index tensors.
+    Raises: ValueError if batch_size or minibatch_size is less than 1.
+    """
+    for name, value in (("batch_size", batch_size), ("minibatch_size", minibatch_size)):
+        if value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
+    return iter(torch.randperm(batch_size, generator=generator).split(minibatch_size))
+
+
+def ppo_loss(log_probs, old_log_probs, advantages, values, returns, entropy, clip_range, vf_coef, ent_coef):
+    """PPO's loss: the clipped surrogate, the critic's squared error, and a bonus for entropy.
+
+        L = -mean(min(ρ A, clip(ρ, 1 - ε, 1 + ε) A)) + c_v mean((V - R)²) - c_e mean(H)
+
+    Schulman et al. (2017), eq. 9, https://arxiv.org/abs/1707.06347
+
+    Args:
+      log_probs: log π(a|s) of the current policy, in nats; (B,). Receives gradient.
+      old_log_probs: the same under the policy that acted; (B,). No gradient.
+      advantages: (B,), taken as given. No gradient.
+      values: V(s) of the current critic, in units of reward; (B,). Receives gradient.
+      returns: the critic's targets, in units of reward; (B,). No gradient.
+      entropy: of the current policy, in nats; (B,) or (). Receives gradient.
+      clip_range: ε ≥ 0, dimensionless; infinity means no clipping.
+      vf_coef: c_v, the weight of the critic's error.
+      ent_coef: c_e, the weight of the entropy.
+
+    Returns: (scalar loss, metrics), where metrics holds policy_loss, value_loss, entropy,
+      approx_kl and clip_fraction as 0-dim tensors without a graph.
+    Raises: ValueError if the shapes of all but entropy differ, entropy is neither (B,) nor
+      (), or clip_range < 0.
+    """
+    validate.same_shape(log_probs=log_probs, old_log_probs=old_log_probs, advantages=advantages, values=values, returns=returns)
+    if entropy.dim():
+        validate.same_shape(entropy=entropy, log_probs=log_probs)
+    validate.non_negative(clip_range=clip_range)
+    weights = advantages.detach()
+    log_ratio = log_probs - old_log_probs.detach()
+    ratio = log_ratio.exp()
+    clipped_ratio = ratio.clamp(1 - clip_range, 1 + clip_range)
+    policy_loss = -torch.minimum(ratio * weights, clipped_ratio * weights).mean()
+    value_loss = (values - returns.detach()).square().mean()
+    loss = policy_loss + vf_coef * value_loss - ent_coef * entropy.mean()
+    with torch.no_grad():
+        metrics = {
+            "policy_loss": policy_loss.detach(),
+            "value_loss": value_loss.detach(),
+            "entropy": entropy.detach().mean(),
+            "approx_kl": (ratio - 1 - log_ratio).mean(),
+            "clip_fraction": ((ratio - 1).abs() > clip_range).to(ratio.dtype).mean(),
+        }
+    return loss, metrics
+
+
+def ppo_update(policy, optimizer, batch, settings, generator):
+    """Improve a policy, in place, by some epochs of minibatches over one rollout.
+
+    Schulman et al. (2017), algorithm 1, https://arxiv.org/abs/1707.06347
+
+    Args:
+      policy: what `evaluate_actions` takes; its parameters are `policy.weights`.
+      optimizer: `optimizer.step(policy, max_grad_norm)` clips the gradient that
+        `backward()` left in `policy.weights.grad`, and makes one step with it.
+      batch: Batch of B steps; `batch[indices]` is a minibatch. Advantages are taken as
+        given.
+      settings: PPOSettings: num_epochs, minibatch_size, clip_range, vf_coef, ent_coef,
+        max_grad_norm, and target_kl: the update ends after an epoch whose mean approx_kl
+        over its minibatches is larger.
+      generator: torch generator, the only source of the minibatches' order.
+
+    Returns: the metrics of ppo_loss, each averaged over all minibatches: a dict of 0-dim
+      tensors.
+    """
+    history = []
+    for _ in range(settings.num_epochs):
+        epoch = []
+        for indices in minibatches(len(batch), settings.minibatch_size, generator):
+            rows = batch[indices]
+            log_probs, entropy, values = evaluate_actions(policy, rows.obs, rows.actions)
+            loss, metrics = ppo_loss(
+                log_probs, rows.old_log_probs, rows.advantages, values, rows.returns, entropy,
+                settings.clip_range, settings.vf_coef, settings.ent_coef,
+            )  # fmt: skip
+            policy.weights.grad = None
+            loss.backward()
+            optimizer.step(policy, settings.max_grad_norm)
+            epoch.append(metrics)
+        history += epoch
+        if torch.stack([metrics["approx_kl"] for metrics in epoch]).mean() > settings.target_kl:
+            break
+    return {name: torch.stack([metrics[name] for metrics in history]).mean() for name in history[0]}
+
+
+def estimate(policy, rollout, settings, reward=None):
+    """Turn a rollout into a batch to learn from, before the policy changes.
+
+    Args:
+      policy: the policy that acted.
+      rollout: Rollout of (T, N) steps.
+      settings: PPOSettings: gamma, gae_lambda, reward_scale, normalize_advantages.
+      reward: `reward(obs, actions, next_obs) -> (T, N)` in place of the environments'
+        rewards.
+
+    Returns: (Batch of T N rows, explained variance of the values).
+    """
+    rewards = rollout.rewards if reward is None else reward(rollout.obs, rollout.actions, rollout.next_obs)
+    with torch.no_grad():
+        log_probs, _, values = evaluate_actions(policy, rollout.obs.flatten(0, 1), rollout.actions.flatten(0, 1))
+    values, next_values = values.view_as(rewards), policy.value(rollout.next_obs)
+    advantages = compute_gae(
+        settings.reward_scale * rewards, values, next_values, rollout.terminated, rollout.truncated,
+        settings.gamma, settings.gae_lambda,
+    )  # fmt: skip
+    returns = lambda_returns(advantages, values)
+    explained = explained_variance(values, returns)
+    if settings.normalize_advantages:
+        advantages = normalize_advantages(advantages)
+    batch = Batch(rollout.obs.flatten(0, 1), rollout.actions.flatten(0, 1), log_probs, advantages.flatten(), returns.flatten())
+    return batch, explained
+
+
+def train_ppo(envs, settings, seed=0, policy=None, reward=None, log=None, update=None):
+    """Train a policy by PPO: collect, estimate, update, log.
+
+    Schulman et al. (2017), algorithm 1, https://arxiv.org/abs/1707.06347
+
+    Args:
+      envs: a vector environment of N environments with same-step autoreset.
+      settings: PPOSettings.
+      seed: of the environments, the new policy's weights, the actions and the
+        minibatches: two runs with one seed are equal bit for bit.
+      policy: the policy to train, in place; None makes a new one.
+      reward: `reward(obs, actions, next_obs) -> (T, N)` to learn from in place of the
+        environments' rewards; what is logged as return stays the environments'.
+      log: called after each update with a row, a dict of floats: env_steps, episodes (that
+        ended in this rollout), mean_return (of those; NaN if none), explained_variance,
+        learning_rate, seconds (since the start), and the metrics of ppo_update.
+      update: what is called in place of ppo_update, with the same arguments.
+
+    Returns: the trained policy.
+    """
+    start, generator = time.perf_counter(), seed_everything(seed)
+    if policy is None:
+        policy = policy_for(envs, settings.hidden, settings.log_std, seed)
+    optimizer, episode_returns = Adam(), EpisodeReturns(envs.num_envs)
+    obs, env_steps = envs.reset(seed=seed)[0], 0
+    while env_steps < settings.total_steps:
+        left = 1 - env_steps / settings.total_steps if settings.anneal else 1.0
+        optimizer.learning_rate = settings.learning_rate * left
+
+        rollout = collect_rollout(envs, policy, settings.num_steps, obs, generator)
+        batch, explained = estimate(policy, rollout, settings, reward)
+        metrics = (update or ppo_update)(policy, optimizer, batch, settings, generator)
+        if settings.normalize_obs:
+            policy.observe(batch.obs)
+
+        obs, env_steps = rollout.last_obs, env_steps + len(batch)
+        finished = episode_returns.add(rollout)
+        if log is not None:
+            log(
+                {
+                    "env_steps": env_steps,
+                    "episodes": len(finished),
+                    "mean_return": sum(finished) / len(finished) if finished else math.nan,
+                    "explained_variance": explained.item(),
+                    "learning_rate": optimizer.learning_rate,
+                    "seconds": time.perf_counter() - start,
+                }
+                | {name: metric.item() for name, metric in metrics.items()}
+            )
+    return policy
+
+
+def fast_ppo_update(policy, optimizer, batch, settings, generator):
+    """What ppo_update does, up to rounding, in a fifth of its time.
+
+    With 64 samples in a minibatch, PyTorch's bookkeeping takes far longer than the
+    arithmetic. So the loss is differentiated on paper, and NumPy does the sums:
+
+        ∂L/∂log π = -ρ A / B where the clip does not bind, else 0
+        ∂L/∂V = 2 c_v (V - R) / B,   ∂L/∂H = -c_e
+
+    The rest is the chain rule through log π and H, in `gaussian_head` and
+    `categorical_head`, and through the networks, in `policy.backward`.
+
+    Args, returns: as ppo_update.
+    """
+    columns = [column.numpy() for column in (batch.obs, batch.actions, batch.old_log_probs, batch.advantages, batch.returns)]
+    columns[0] = policy.normalize(columns[0])
+    head = categorical_head if policy.discrete else gaussian_head
+    low, high = 1 - settings.clip_range, 1 + settings.clip_range
+    history = []
+    policy.weights.grad = torch.from_numpy(policy.gradient)  # one memory: what `backward` writes is what `step` reads
+    for _ in range(settings.num_epochs):
+        epoch = []
+        for indices in minibatches(len(batch), settings.minibatch_size, generator):
+            obs, actions, old_log_probs, advantages, returns = (column[indices.numpy()] for column in columns)
+            actor, critic = policy.forward("actor", obs), policy.forward("critic", obs)
+            log_probs, entropy, pull_back = head(policy, actor[-1], actions)
+            log_ratio, errors = log_probs - old_log_probs, critic[-1][:, 0] - returns
+            ratio = np.exp(log_ratio)
+            gains, clipped_gains = ratio * advantages, np.minimum(np.maximum(ratio, low), high) * advantages
+            outputs_gradient = pull_back(np.where(gains <= clipped_gains, gains, 0) / -len(gains), -settings.ent_coef)
+            policy.backward("actor", actor, outputs_gradient)
+            policy.backward("critic", critic, (2 * settings.vf_coef / len(errors)) * errors[:, None])
+            optimizer.step(policy, settings.max_grad_norm)
+            outside = np.count_nonzero(np.abs(ratio - 1) > settings.clip_range)
+            sums = -np.minimum(gains, clipped_gains).sum(), errors @ errors, (ratio - 1 - log_ratio).sum(), outside
+            epoch.append((sums[0], sums[1], entropy * len(gains), sums[2], sums[3]) / np.float32(len(gains)))
+        history += epoch
+        if np.mean([metrics[3] for metrics in epoch]) > settings.target_kl:
+            break
+    names = "policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction"
+    return dict(zip(names, torch.as_tensor(np.mean(history, axis=0)), strict=True))
+
+
+def gaussian_head(policy, mean, actions):
+    """Log-probabilities (B,), mean entropy, and the chain rule through both.
+
+    Returns: (log_probs, entropy, pull_back), where pull_back(d_log_probs (B,), d_entropy)
+      gives the gradient of the mean, (B, A), and leaves that of log_std in the policy.
+    """
+    log_std = policy.arrays["log_std"]
+    inverse = np.exp(-log_std)
+    scaled = (actions - mean) * inverse
+    squares = scaled * scaled
+    constant = log_std.sum() + 0.5 * math.log(2 * math.pi) * len(log_std)
+
+    def pull_back(d_log_probs, d_entropy):
+        policy.gradients["log_std"][:] = d_log_probs @ (squares - 1) + d_entropy
+        return d_log_probs[:, None] * scaled * inverse
+
+    return -0.5 * squares.sum(1) - constant, constant + 0.5 * len(log_std), pull_back
+
+
+def categorical_head(policy, logits, actions):
+    """The same for discrete actions: pull_back gives the gradient of the logits."""
+    shifted = logits - logits.max(1, keepdims=True)
+    log_all = shifted - np.log(np.exp(shifted).sum(1, keepdims=True))
+    probs, rows = np.exp(log_all), np.arange(len(logits))
+    entropies = -(probs * log_all).sum(1)
+
+    def pull_back(d_log_probs, d_entropy):
+        gradient = -(d_log_probs[:, None] + (d_entropy / len(rows)) * (log_all + entropies[:, None])) * probs
+        gradient[rows, actions] += d_log_probs
+        return gradient
+
+    return log_all[rows, actions], entropies.mean(), pull_back
