@@ -18,14 +18,10 @@ class Demonstrations:
 
 
 class SquaredError:
-    """A loss for `train_bc`: the mean of (output - action)², whose best constant answer is the actions' mean."""
+    """A loss: the mean of (gain · output - action)², for `loss_fn(outputs, actions)`."""
+
+    def __init__(self, gain=1.0):
+        self.gain = gain
 
     def __call__(self, outputs, actions):
-        return (outputs - actions).square().mean()
-
-
-class AbsoluteError:
-    """A loss for `train_bc`: the mean of |output - action|, whose best constant answer is the actions' median."""
-
-    def __call__(self, outputs, actions):
-        return (outputs - actions).abs().mean()
+        return (self.gain * outputs - actions).square().mean()

@@ -8,6 +8,10 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+OBSERVATIONS = gym.spaces.Box(-np.inf, np.inf, (5,), np.float32)
+COMMANDS = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+CHOICES = gym.spaces.Discrete(3)
+
 
 class RoadEnv(gym.Env):
     """A rover that must keep to a winding road. Only the steering is to be chosen; the speed is constant.
@@ -42,8 +46,8 @@ class RoadEnv(gym.Env):
             if value < 0:
                 raise ValueError(f"{name} must not be negative, got {value}")
         self.time_limit, self.gust, self.bend, self.start, self.discrete = time_limit, gust, bend, start, discrete
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (5,), np.float32)
-        self.action_space = gym.spaces.Discrete(3) if discrete else gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.observation_space = OBSERVATIONS
+        self.action_space = CHOICES if discrete else COMMANDS
         self.ended = True
 
     def reset(self, *, seed=None, options=None):

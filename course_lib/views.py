@@ -45,15 +45,22 @@ def two_splits(arguments: dict[str, Any], outputs: dict[str, np.ndarray]) -> dic
 
 
 def training_curve(_arguments: dict[str, Any], outputs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Of a training run's losses: how many there are, the first, and the mean of the last tenth."""
+    """Of a training run's losses: how many there are, the first, and whether the last is smaller, and by a quarter."""
     losses = outputs.get("")
     if losses is None or losses.ndim != 1 or not len(losses) or losses.dtype.kind != "f":
         raise ValueError("the losses must be a tensor of numbers, one for each step")
-    return {"number of losses": np.array(len(losses)), "first loss": losses[0], "last losses": losses[-max(len(losses) // 10, 1) :].mean()}
+    return {
+        "number of losses": np.array(len(losses)),
+        "first loss": losses[0].astype(np.float32),
+        "the loss falls": np.array(bool(losses[-1] < losses[0])),
+        "it falls by a quarter": np.array(bool(losses[-1] < 0.75 * losses[0])),
+    }
 
 
 def _masks(outputs: dict[str, np.ndarray], paths: tuple[str, ...], size: int) -> list[np.ndarray]:
-    masks = [outputs.get(path) for path in paths]
-    if len(outputs) != len(paths) or any(mask is None or mask.dtype != bool or mask.shape != (size,) for mask in masks):
-        raise ValueError("train and held_out must be bool masks over the steps")
-    return [mask for mask in masks if mask is not None]
+    masks = [outputs[path] for path in paths if path in outputs]
+    if len(masks) < len(outputs) or len(masks) < len(paths) or any(mask.shape != (size,) for mask in masks):
+        raise ValueError("train and held_out must have an entry for each step")
+    if any(mask.dtype != bool for mask in masks):
+        raise ValueError("train and held_out must be bool")
+    return masks

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
 import torch
 from torch.nn import functional as F
 
-from autograder.spec import Case, Exercise, Misconception
+from autograder import spec
+from autograder.spec import Exercise, Misconception
 from course_lib import validate
 from course_lib.cases import built
 from course_lib.demonstrations import Demonstrations
 from solutions import ch74
+
+Case = functools.partial(spec.Case)  # one hidden draw of each: episodes and training runs cost time
 
 # ---------------------------------------------------------------------------------------------------------------- inputs
 
@@ -57,7 +61,9 @@ _DISCOUNT = "Report the undiscounted return: gamma belongs to learning, not to t
 _ADDED_UP = "The sum of rewards runs on from episode to episode: set it back to 0 at each reset."
 _LENGTHS = "These are the episodes' lengths: add up the rewards."
 _LAST_REWARD = "The reward of the last step is missing: add it before you leave the loop."
-_BATCH = "A policy takes a batch of observations, (B, O): call it with policy(obs.unsqueeze(0)), and take the row out of its answer."
+_BATCH = (
+    "A policy takes a batch of observations, (B, O): call it with policy(obs.unsqueeze(0)), and take the row out of its answer."
+)
 _EPISODES = "num_episodes = 0 asks for nothing: refuse it with a ValueError that names num_episodes."
 
 # ----------------------------------------------------------------------------------------------- collect_demonstrations
@@ -70,7 +76,7 @@ def _drive(env, policy, **settings):
         return {
             "policy": policy(generator),
             "env": env,
-            "num_episodes": 3,
+            "num_episodes": 2,
             "seed": _integer(generator, 10_000),
         } | settings
 
@@ -88,16 +94,16 @@ def _strong(generator):
 
 def _weak(generator):
     """Hardly any command: the rover leaves the road where it bends, sooner or later."""
-    return built("road.LinearPolicy", weights=0.05 * _normal(generator, 1, 5), bias=0.3 + 0.1 * _normal(generator, 1).abs())
+    return built("road.LinearPolicy", weights=0.05 * _normal(generator, 1, 5), bias=0.6 + 0.1 * _normal(generator, 1).abs())
 
 
 def _three_commands(generator):
     return built("road.LinearPolicy", weights=_normal(generator, 3, 5), bias=0.1 * _normal(generator, 3), discrete=True)
 
 
-_ROAD = built("road.RoadEnv", time_limit=6, gust=0.05, start=0.7)
-_OPEN_ROAD = built("road.RoadEnv", time_limit=None, gust=0.02, start=0.7)
-_DISCRETE_ROAD = built("road.RoadEnv", time_limit=7, gust=0.05, discrete=True)
+_ROAD = built("road.RoadEnv", time_limit=4, gust=0.05, start=0.7)
+_OPEN_ROAD = built("road.RoadEnv", time_limit=None, gust=0.05, start=0.7)
+_DISCRETE_ROAD = built("road.RoadEnv", time_limit=4, gust=0.05, discrete=True)
 
 
 def _roll(
@@ -241,13 +247,13 @@ COLLECT_DEMONSTRATIONS = Exercise(
     reference=ch74.collect_demonstrations,
     criteria={"values": 1.2, "gradient": 0.1, "dtype": 0.1, "errors": 0.1},
     cases=(
-        Case("three episodes that are cut off", _drive(_ROAD, _driver()), visible=True),
-        Case("three episodes that end off the road", _drive(_OPEN_ROAD, _weak), visible=True),
+        Case("episodes that are cut off", _drive(_ROAD, _driver()), visible=True),
+        Case("episodes that end off the road", _drive(_OPEN_ROAD, _weak), visible=True),
         Case("commands beyond ±1", _drive(_ROAD, _strong), visible=True),
         Case("discrete commands", _drive(_DISCRETE_ROAD, _three_commands)),
         Case("a single episode", _drive(_ROAD, _driver(), num_episodes=1)),
         Case("one step an episode", _drive(built("road.RoadEnv", time_limit=1), _driver(), num_episodes=4)),
-        Case("num_episodes = 0", _drive(_ROAD, _driver(), num_episodes=0), raises=["num_episodes"], visible=True, draws=1),
+        Case("num_episodes = 0", _drive(_ROAD, _driver(), num_episodes=0), raises=["num_episodes"], visible=True),
     ),
     misconceptions=(
         Misconception(
@@ -263,7 +269,9 @@ COLLECT_DEMONSTRATIONS = Exercise(
         Misconception("last-step-missing", _demonstrations(keep_last=False), _ONLY_LAST),
         Misconception(
             "actions-clipped",
-            _demonstrations(_replaced(actions=lambda seen, _: seen.actions.clamp(-1, 1) if seen.actions.ndim > 1 else seen.actions)),
+            _demonstrations(
+                _replaced(actions=lambda seen, _: seen.actions.clamp(-1, 1) if seen.actions.ndim > 1 else seen.actions)
+            ),
             "Write the actions down as the policy returned them; what the environment makes of them is its own affair.",
         ),
         Misconception("same-seed-each-episode", _demonstrations(reset=lambda env, seed, _: env.reset(seed=seed)), _SAME_SEED),
@@ -355,7 +363,7 @@ def _one_giant(generator):
 
 def _odd_numbers(generator):
     """Numbers with gaps, and the steps of all episodes mixed."""
-    ids = _steps([6] * 20, 5 + 13 * torch.arange(20))
+    ids = _steps([1] * 400, 5 + 13 * torch.arange(400))
     return ids[torch.randperm(len(ids), generator=generator)]
 
 
@@ -478,7 +486,7 @@ SPLIT_BY_EPISODE = Exercise(
         Case("forty uneven episodes, a quarter held out", _split(_uneven, 0.25), view="episode_split", visible=True),
         Case("thirty episodes, one of them a giant", _split(_one_giant, 0.1), view="episode_split", draws=4),
         Case("two hundred short episodes, half held out", _split(_even(200, 3), 0.5), view="episode_split", draws=4),
-        Case("numbers with gaps, steps in any order", _split(_odd_numbers, 0.3), view="episode_split", visible=True),
+        Case("numbers with gaps, steps in any order", _split(_odd_numbers, 0.3), view="episode_split", visible=True, draws=3),
         Case("three episodes, a tenth held out", _split(_even(3), 0.1), view="episode_split", visible=True),
         Case("three episodes, nearly all held out", _split(_even(3), 0.95), view="episode_split"),
         Case("two splits in a row", _split(_even(60, 2), 0.5), repeat=2, view="two_splits", visible=True),
@@ -488,9 +496,9 @@ SPLIT_BY_EPISODE = Exercise(
             returns=("generator",),
             visible=True,
         ),
-        Case("fraction = -0.1", _split(_even(5), -0.1), raises=["fraction"], draws=1),
-        Case("fraction = 20", _split(_even(5), 20.0), raises=["fraction"], visible=True, draws=1),
-        Case("a single episode", _split(_even(1), 0.5), raises=["episode_ids"], draws=1),
+        Case("fraction = -0.1", _split(_even(5), -0.1), raises=["fraction"]),
+        Case("fraction = 20", _split(_even(5), 20.0), raises=["fraction"], visible=True),
+        Case("a single episode", _split(_even(1), 0.5), raises=["episode_ids"]),
     ),
     misconceptions=(
         Misconception(
@@ -618,7 +626,9 @@ def _by_hand(logits, expert_actions):
     return torch.tensor(sum(surprises) / len(surprises), dtype=torch.float64)
 
 
-_LOGITS_SHAPES = "logits must be (B, A) with one expert action for each row, (B,): a column of actions fails late or, worse, not at all."
+_LOGITS_SHAPES = (
+    "logits must be (B, A) with one expert action for each row, (B,): a column of actions fails late or, worse, not at all."
+)
 
 BEHAVIOURAL_CLONING_LOSS = Exercise(
     name="behavioural_cloning_loss",
@@ -642,13 +652,11 @@ BEHAVIOURAL_CLONING_LOSS = Exercise(
             _changed("expert_actions", lambda a: a[:, None], _choices()),
             raises=["logits", "expert_actions"],
             visible=True,
-            draws=1,
         ),
         Case(
             "an expert action too few",
             _changed("expert_actions", lambda a: a[:-1], _choices()),
             raises=["logits", "expert_actions"],
-            draws=1,
         ),
     ),
     misconceptions=(
@@ -807,20 +815,20 @@ GAUSSIAN_CLONING_LOSS = Exercise(
             _changed("expert_actions", lambda a: a[:, :1], _continuous()),
             raises=_PAIR,
             visible=True,
-            draws=1,
         ),
-        Case("expert_actions of a single row", _changed("expert_actions", lambda a: a[0], _continuous()), raises=_PAIR, draws=1),
+        Case("expert_actions of a single row", _changed("expert_actions", lambda a: a[0], _continuous()), raises=_PAIR),
         Case(
             "log_std as a column",
             _changed("log_std", lambda s: s[:, :1], _continuous(per_state=True)),
             raises=["log_std"],
-            draws=1,
         ),
     ),
     misconceptions=(
         Misconception(
             "log-std-taken-as-std",
-            _gaussian(lambda m, s, a: ((a - m) / s).square().div(2).add(s.abs().log()).add(math.log(2 * math.pi) / 2).sum(-1).mean()),
+            _gaussian(
+                lambda m, s, a: ((a - m) / s).square().div(2).add(s.abs().log()).add(math.log(2 * math.pi) / 2).sum(-1).mean()
+            ),
             "log_std is the logarithm of σ: σ = log_std.exp().",
         ),
         Misconception(
@@ -845,7 +853,9 @@ GAUSSIAN_CLONING_LOSS = Exercise(
         ),
         Misconception(
             "constant-once",
-            _gaussian(lambda m, s, a: (_surprise(m, s, a) - math.log(2 * math.pi) / 2).sum(-1).mean() + math.log(2 * math.pi) / 2),
+            _gaussian(
+                lambda m, s, a: (_surprise(m, s, a) - math.log(2 * math.pi) / 2).sum(-1).mean() + math.log(2 * math.pi) / 2
+            ),
             "½ log 2π belongs to every action component, and counts A times.",
         ),
         Misconception(
@@ -859,7 +869,11 @@ GAUSSIAN_CLONING_LOSS = Exercise(
             "Components of one action are independent, so their log-likelihoods add up: sum over A, mean over B.",
         ),
         Misconception("sum-over-batch", _gaussian(lambda m, s, a: _surprise(m, s, a).sum()), _SUM),
-        Misconception("per-step-losses", _gaussian(lambda m, s, a: _surprise(m, s, a).sum(-1)), "One number is asked for: take the mean over B."),
+        Misconception(
+            "per-step-losses",
+            _gaussian(lambda m, s, a: _surprise(m, s, a).sum(-1)),
+            "One number is asked for: take the mean over B.",
+        ),
         Misconception("sign-missing", _gaussian(lambda m, s, a: -_surprise(m, s, a).sum(-1).mean()), _SIGN),
         Misconception(
             "squared-error",
@@ -872,7 +886,9 @@ GAUSSIAN_CLONING_LOSS = Exercise(
             "No gradient reaches log_std, so σ is never learned: only the expert's actions are data.",
         ),
         Misconception(
-            "mean-detached", _gaussian(lambda m, s, a: _surprise(m.detach(), s, a).sum(-1).mean()), "No gradient reaches the mean, which is to learn."
+            "mean-detached",
+            _gaussian(lambda m, s, a: _surprise(m.detach(), s, a).sum(-1).mean()),
+            "No gradient reaches the mean, which is to learn.",
         ),
         Misconception(
             "gradient-into-expert-actions",
@@ -897,9 +913,7 @@ GAUSSIAN_CLONING_LOSS = Exercise(
             lambda m, s, a: F.gaussian_nll_loss(m, a, (2 * s).exp().expand_as(m), full=True, eps=1e-30, reduction="sum") / len(m)
         ),
         "one row at a time": _gaussian(
-            lambda m, s, a: torch.stack(
-                [_surprise(x, y, z).sum() for x, y, z in zip(m, s.expand_as(m), a, strict=True)]
-            ).mean()
+            lambda m, s, a: torch.stack([_surprise(x, y, z).sum() for x, y, z in zip(m, s.expand_as(m), a, strict=True)]).mean()
         ),
     },
 )
@@ -907,23 +921,23 @@ GAUSSIAN_CLONING_LOSS = Exercise(
 # --------------------------------------------------------------------------------------------------------------- train_bc
 
 
-def _regression(loss="SquaredError", rows=48, batch_size=48, num_steps=50, maker="seeding.generator", noise=0.3, skewed=False):
-    """Linear data for a linear network that begins at 0; `skewed` noise has another median than mean."""
+def _regression(gain=1.0, rows=48, batch_size=48, num_steps=17, maker="seeding.generator", noise=0.3):
+    """Linear data for a linear network that begins at 0, and squared errors of `gain` times its output."""
 
     def inputs(generator):
-        obs = _normal(generator, rows, 2)
-        obs = (obs - obs.mean(0)) / obs.std(0)
+        obs = math.sqrt(12) * (torch.rand(rows, 2, generator=generator, dtype=torch.float64) - 0.5)
+        if batch_size == 1:  # each row says something about one of the two weights only
+            obs = 1.5 * obs.sign() * F.one_hot(torch.arange(rows) % 2)
         signs = torch.randint(2, (1, 2), generator=generator) * 2 - 1
-        errors = _normal(generator, rows, 1)
-        errors = errors.square().square() - 0.3 if skewed else noise * errors
+        errors = noise * _normal(generator, rows, 1)
         return {
             "network": built("road.LinearPolicy", weights=torch.zeros(1, 2), bias=torch.zeros(1)),
-            "loss_fn": built(f"demonstrations.{loss}"),
+            "loss_fn": built("demonstrations.SquaredError", gain=gain),
             "obs": obs,
             "actions": obs @ (1.5 * signs.double()).T + 0.8 + errors,
             "num_steps": num_steps,
             "batch_size": batch_size,
-            "learning_rate": 0.1,
+            "learning_rate": 0.15,
             "generator": built(maker, seed=_integer(generator, 10_000)),
         }
 
@@ -932,7 +946,7 @@ def _regression(loss="SquaredError", rows=48, batch_size=48, num_steps=50, maker
 
 def _lines(generator):
     """The same in single precision, where the network computes."""
-    drawn = _regression()(generator)
+    drawn = _regression(num_steps=5)(generator)
     return drawn | {name: drawn[name].float() for name in ("obs", "actions")}
 
 
@@ -1032,31 +1046,34 @@ def _least_squares(network, loss_fn, obs, actions, **_settings):
     network.bias.data.copy_(solution[2])
 
 
-_NETWORK = {"returns": ("network",), "atol": 0.2, "rtol": 0.05}
+_NETWORK = {"returns": ("network",), "atol": 0.6}
 
 TRAIN_BC = Exercise(
     name="train_bc",
     reference=ch74.train_bc,
     criteria={"values": 0.8, "gradient": 0.05, "inputs": 0.05, "errors": 0.1},
     cases=(
-        Case("a linear network on linear data", _regression(), closed_form=_least_squares, visible=True, draws=1, **_NETWORK),
-        Case("minibatches of ten", _regression(batch_size=10, noise=0.0), closed_form=_least_squares, draws=1, **_NETWORK),
-        Case("absolute errors, skewed noise", _regression("AbsoluteError", rows=60, batch_size=60, skewed=True), draws=1, **_NETWORK),
-        Case("the losses on the way", _lines, view="training_curve", atol=0.1, dtype=torch.float32, visible=True, draws=1),
+        Case("a linear network on linear data", _regression(), closed_form=_least_squares, visible=True, **_NETWORK),
+        Case(
+            "a row at a time, no noise",
+            _regression(batch_size=1, num_steps=40, noise=0.0),
+            closed_form=_least_squares,
+            **_NETWORK,
+        ),
+        Case("a loss of twice the output", _regression(gain=2.0, num_steps=16), **_NETWORK),
+        Case("the losses on the way", _lines, view="training_curve", dtype=torch.float32, visible=True),
         Case(
             "the generator is drawn from",
             _regression(batch_size=5, num_steps=2, maker="seeding.WatchedGenerator"),
             returns=("generator",),
             visible=True,
-            draws=1,
         ),
-        Case("num_steps = 0", _regression(num_steps=0), raises=["num_steps"], draws=1),
+        Case("num_steps = 0", _regression(num_steps=0), raises=["num_steps"]),
         Case(
             "actions with a row too few",
             _changed("actions", lambda a: a[:-1], _regression(num_steps=2)),
             raises=["obs", "actions"],
             visible=True,
-            draws=1,
         ),
     ),
     misconceptions=(
@@ -1065,7 +1082,9 @@ TRAIN_BC = Exercise(
             _trained(_accumulating),
             "Gradients add up from step to step: call optimizer.zero_grad() before each backward().",
         ),
-        Misconception("no-step", _trained(_standing_still), "The network never changes: optimizer.step() must follow backward()."),
+        Misconception(
+            "no-step", _trained(_standing_still), "The network never changes: optimizer.step() must follow backward()."
+        ),
         Misconception(
             "uphill",
             _trained(loss=lambda loss_fn, outputs, actions: -loss_fn(outputs, actions), kept=lambda loss: -loss.detach()),
@@ -1105,7 +1124,9 @@ TRAIN_BC = Exercise(
             "The minibatches come from the global generator: pass generator=generator.",
         ),
         Misconception(
-            "only-the-last-loss", _trained(result=lambda losses: losses[-1]), "Return the losses of all steps, (num_steps,), not the last one."
+            "only-the-last-loss",
+            _trained(result=lambda losses: losses[-1]),
+            "Return the losses of all steps, (num_steps,), not the last one.",
         ),
         Misconception(
             "a-list-of-numbers",
@@ -1120,7 +1141,7 @@ TRAIN_BC = Exercise(
         Misconception(
             "bad-input-accepted",
             _trained(checked=False, result=lambda losses: torch.stack(losses) if losses else torch.zeros(0)),
-            "Rows that do not pair up train on the wrong actions where no index happens to be out of range: compare the numbers of rows first.",
+            "Rows that do not pair up train on wrong actions where no index is out of range: compare the numbers of rows first.",
         ),
     ),
     variants={
@@ -1179,19 +1200,25 @@ EVALUATE = Exercise(
     reference=ch74.evaluate,
     criteria={"values": 0.75, "gradient": 0.05, "dtype": 0.1, "errors": 0.1},
     cases=(
-        Case("three episodes that are cut off", _drive(_ROAD, _driver()), visible=True),
-        Case("four episodes that end off the road", _drive(_OPEN_ROAD, _weak, num_episodes=4), visible=True),
+        Case("episodes that are cut off", _drive(_ROAD, _driver()), visible=True),
+        Case("episodes that end off the road", _drive(_OPEN_ROAD, _weak, num_episodes=4), visible=True),
         Case("commands beyond ±1", _drive(_ROAD, _strong)),
         Case("discrete commands", _drive(_DISCRETE_ROAD, _three_commands), visible=True),
         Case("a single episode", _drive(_ROAD, _driver(), num_episodes=1)),
-        Case("num_episodes = 0", _drive(_ROAD, _driver(), num_episodes=0), raises=["num_episodes"], visible=True, draws=1),
+        Case("num_episodes = 0", _drive(_ROAD, _driver(), num_episodes=0), raises=["num_episodes"], visible=True),
     ),
     misconceptions=(
         Misconception(
-            "averaged", _returns(lambda returns, _: returns.mean()), "One return for each episode is asked for, (E,): average later."
+            "averaged",
+            _returns(lambda returns, _: returns.mean()),
+            "One return for each episode is asked for, (E,): average later.",
         ),
         Misconception("discounted", _returns(gamma=0.99), _DISCOUNT),
-        Misconception("reward-per-step", _returns(lambda returns, lengths: returns / lengths), "A return is a sum of rewards, not their mean."),
+        Misconception(
+            "reward-per-step",
+            _returns(lambda returns, lengths: returns / lengths),
+            "A return is a sum of rewards, not their mean.",
+        ),
         Misconception("lengths-for-returns", _returns(lambda _, lengths: lengths), _LENGTHS),
         Misconception("last-reward-missing", _returns(count_last=False), _LAST_REWARD),
         Misconception("added-up", _returns(carry=True), _ADDED_UP),
@@ -1203,10 +1230,14 @@ EVALUATE = Exercise(
         Misconception("termination-ignored", _returns(ended=lambda _, truncated: truncated), _TERMINATED),
         Misconception("batch-axis-missing", _returns(call=lambda policy, obs: policy(obs)), _BATCH),
         Misconception(
-            "a-list-of-numbers", _returns(lambda returns, _: returns.tolist()), "Return a tensor of shape (E,), not a list of numbers."
+            "a-list-of-numbers",
+            _returns(lambda returns, _: returns.tolist()),
+            "Return a tensor of shape (E,), not a list of numbers.",
         ),
         Misconception(
-            "dtype-lost", _returns(lambda returns, _: returns.double()), "The returns are to be float32; NumPy's own numbers are float64."
+            "dtype-lost",
+            _returns(lambda returns, _: returns.double()),
+            "The returns are to be float32; NumPy's own numbers are float64.",
         ),
         Misconception("bad-input-accepted", _returns(checked=False), _EPISODES),
     ),
@@ -1301,20 +1332,18 @@ STATE_SHIFT = Exercise(
     cases=(
         Case("two clouds", _clouds(), closed_form=_shift_by_hand, visible=True, draws=3),
         Case("equal samples: 0", _twice_the_same, visible=True),
-        Case("two points and one, by hand", _two_points, closed_form=_shift_by_hand, visible=True, draws=1),
+        Case("two points and one, by hand", _two_points, closed_form=_shift_by_hand, visible=True),
         Case("one dimension", _clouds(dims=1), closed_form=_shift_by_hand),
         Case("far apart", _clouds(moved=40.0), closed_form=_shift_by_hand),
         Case("a narrow agent", _clouds((9, 20), widened=0.1, moved=0.0), closed_form=_shift_by_hand),
-        Case("more rows than one block", _clouds((300, 150))),
         Case("single precision", _clouds(), dtype=torch.float32, visible=True),
         Case(
             "agent_obs with a dimension too few",
             _changed("agent_obs", lambda x: x[:, :1], _clouds()),
             raises=_SHIFT_PAIR,
             visible=True,
-            draws=1,
         ),
-        Case("agent_obs as a single row", _changed("agent_obs", lambda x: x[0], _clouds()), raises=_SHIFT_PAIR, draws=1),
+        Case("agent_obs as a single row", _changed("agent_obs", lambda x: x[0], _clouds()), raises=_SHIFT_PAIR),
     ),
     misconceptions=(
         Misconception(
@@ -1338,7 +1367,9 @@ STATE_SHIFT = Exercise(
             "Ordered pairs: (i, j) and (j, i) both count, and here only one of them does.",
         ),
         Misconception(
-            "not-scaled", _shift(scale=lambda expert, agent: 1.0), "Nothing is scaled: the dimension with the largest unit decides alone."
+            "not-scaled",
+            _shift(scale=lambda expert, agent: 1.0),
+            "Nothing is scaled: the dimension with the largest unit decides alone.",
         ),
         Misconception(
             "scaled-by-the-agent",
@@ -1347,9 +1378,9 @@ STATE_SHIFT = Exercise(
         ),
         Misconception(
             "each-by-its-own",
-            lambda expert_obs, agent_obs: _shift(
-                lambda x, y: _energy(x, y / agent_obs.std(0) * expert_obs.std(0))
-            )(expert_obs, agent_obs),
+            lambda expert_obs, agent_obs: _shift(lambda x, y: _energy(x, y / agent_obs.std(0) * expert_obs.std(0)))(
+                expert_obs, agent_obs
+            ),
             "Each sample is divided by its own deviation, which hides that one is wider: use the expert's for both.",
         ),
         Misconception(
@@ -1368,7 +1399,9 @@ STATE_SHIFT = Exercise(
             "One deviation over all entries is used: each dimension has its own, std(0).",
         ),
         Misconception(
-            "root-taken", _shift(lambda x, y: _energy(x, y).clamp(min=0).sqrt()), "The *squared* energy distance is asked for: take no root."
+            "root-taken",
+            _shift(lambda x, y: _energy(x, y).clamp(min=0).sqrt()),
+            "The *squared* energy distance is asked for: take no root.",
         ),
         Misconception(
             "distances-squared",
@@ -1385,7 +1418,9 @@ STATE_SHIFT = Exercise(
             _shift(lambda x, y: torch.stack([_energy(x[:, [i]], y[:, [i]]) for i in range(x.shape[1])]).mean()),
             "The dimensions are compared one by one, which cannot see how they belong together: use the distance of whole states.",
         ),
-        Misconception("sign-flipped", _shift(lambda x, y: -_energy(x, y)), "The sign is flipped: the distances within are subtracted."),
+        Misconception(
+            "sign-flipped", _shift(lambda x, y: -_energy(x, y)), "The sign is flipped: the distances within are subtracted."
+        ),
         Misconception("python-float", _shift(lambda x, y: _energy(x, y).item()), "Return a 0-dim tensor, not a Python float."),
         Misconception("dtype-lost", _after(ch74.state_shift, torch.Tensor.float), _DTYPE),
         Misconception(
@@ -1403,7 +1438,9 @@ STATE_SHIFT = Exercise(
                 x - x.mean(0), y - x.mean(0), lambda a, b: torch.stack([torch.linalg.vector_norm(row - b, dim=1) for row in a])
             )
         ),
-        "in double precision": lambda expert_obs, agent_obs: _shift()(expert_obs.double(), agent_obs.double()).to(expert_obs.dtype),
+        "in double precision": lambda expert_obs, agent_obs: _shift()(expert_obs.double(), agent_obs.double()).to(
+            expert_obs.dtype
+        ),
     },
 )
 
@@ -1483,13 +1520,11 @@ REPAIRED_PAIRS = Exercise(
             _changed("actions", lambda a: a[:-1], _log()),
             raises=["obs", "actions", "episode_ids"],
             visible=True,
-            draws=1,
         ),
         Case(
             "episode_ids with a row too many",
             _changed("episode_ids", lambda ids: torch.cat([ids, ids[-1:]]), _log()),
             raises=["obs", "actions", "episode_ids"],
-            draws=1,
         ),
     ),
     misconceptions=(
@@ -1516,12 +1551,12 @@ REPAIRED_PAIRS = Exercise(
         Misconception(
             "rolled-within-episodes",
             _pairs(_by_episode(lambda obs, actions: (obs.roll(1, 0), actions))),
-            "Each episode's first action is paired with the episode's last observation. What the driver saw then is not in the log: drop it.",
+            "Each episode's first action is paired with the episode's last observation. What the driver saw is not in the log: drop it.",
         ),
         Misconception(
             "first-row-kept",
             _pairs(_by_episode(lambda obs, actions: (torch.cat([obs[:1], obs[:-1]]), actions))),
-            "Each episode's first action is paired with an observation that came after it. What the driver saw then is lost: drop the pair.",
+            "Each episode's first action is paired with an observation that came after it. What the driver saw is lost: drop the pair.",
         ),
         Misconception(
             "shifted-by-two",
