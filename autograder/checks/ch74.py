@@ -357,7 +357,7 @@ def _uneven(generator):
 def _one_giant(generator):
     """Thirty episodes of which one holds nearly all steps."""
     lengths = [2] * 30
-    lengths[_integer(generator, 30)] = 940
+    lengths[_integer(generator, 30)] = 240
     return _steps(lengths)
 
 
@@ -484,8 +484,8 @@ SPLIT_BY_EPISODE = Exercise(
     cases=(
         Case("ten even episodes, a fifth held out", _split(_even(10), 0.2), view="episode_split", visible=True),
         Case("forty uneven episodes, a quarter held out", _split(_uneven, 0.25), view="episode_split", visible=True),
-        Case("thirty episodes, one of them a giant", _split(_one_giant, 0.1), view="episode_split", draws=4),
-        Case("two hundred short episodes, half held out", _split(_even(200, 3), 0.5), view="episode_split", draws=4),
+        Case("thirty episodes, one of them a giant", _split(_one_giant, 0.1), view="episode_split", draws=2),
+        Case("two hundred short episodes, half held out", _split(_even(200, 3), 0.5), view="episode_split", draws=2),
         Case("numbers with gaps, steps in any order", _split(_odd_numbers, 0.3), view="episode_split", visible=True, draws=3),
         Case("three episodes, a tenth held out", _split(_even(3), 0.1), view="episode_split", visible=True),
         Case("three episodes, nearly all held out", _split(_even(3), 0.95), view="episode_split"),
@@ -1056,7 +1056,7 @@ TRAIN_BC = Exercise(
         Case("a linear network on linear data", _regression(), closed_form=_least_squares, visible=True, **_NETWORK),
         Case(
             "a row at a time, no noise",
-            _regression(batch_size=1, num_steps=40, noise=0.0),
+            _regression(batch_size=1, num_steps=32, noise=0.0),
             closed_form=_least_squares,
             **_NETWORK,
         ),
@@ -1115,18 +1115,13 @@ TRAIN_BC = Exercise(
         ),
         Misconception(
             "epochs-for-steps",
-            _trained(steps=lambda num_steps: 3 * num_steps),
+            _trained(steps=lambda num_steps: 2 * num_steps),
             "There are more losses than num_steps: one gradient step counts as one, not one pass over the data.",
         ),
         Misconception(
             "global-generator",
             _trained(rows=lambda count, batch_size, _generator: torch.randperm(count)[:batch_size]),
             "The minibatches come from the global generator: pass generator=generator.",
-        ),
-        Misconception(
-            "only-the-last-loss",
-            _trained(result=lambda losses: losses[-1]),
-            "Return the losses of all steps, (num_steps,), not the last one.",
         ),
         Misconception(
             "a-list-of-numbers",
