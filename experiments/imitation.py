@@ -25,8 +25,8 @@ from experiments.runner import Report, Result
 from solutions.ch74 import collect_demonstrations, gaussian_cloning_loss, state_shift, train_bc
 
 ENVIRONMENT = "LunarLanderContinuous-v3"
-EVALUATION = {"episodes": 30, "evaluation_seed": 1_000_000}
-TRAINING = {"num_steps": 1500, "batch_size": 128, "learning_rate": 2e-3, "hidden": 64}
+EVALUATION = {"episodes": 12, "evaluation_seed": 1_000_000}
+TRAINING = {"num_steps": 1000, "batch_size": 128, "learning_rate": 2e-3, "hidden": 64}
 FILMED_SEED = 7
 SLICES = range(0, 401, 10)  # steps after the start at which the drift is measured
 SAMPLE = 2000  # states of either side that a state shift is computed from
