@@ -22,7 +22,6 @@ from autograder.chapter import ANSWER_LINE, Cell, Chapter, ChapterError
 from autograder.contract import STUB, Reference, Sources, references
 from autograder.contract import sources as real_sources
 from autograder.references import References
-from course_lib.cases import FACET_TEXT
 
 Outputs = Sequence[list[NotebookNode]]
 
@@ -206,8 +205,7 @@ def _unannounced(chapter: Chapter, stub: Cell) -> ChapterError:
 def _criteria(cell: Cell, sources: Sources) -> str:
     """What an exercise is worth, and for what."""
     exercise = sources.exercise(str(cell.exercise))
-    shares = ", ".join(f"{points:g} if it {FACET_TEXT[name]}" for name, points in exercise.criteria.items())
-    return f"**{_points(exercise.points)}:** {shares}. Nothing is paid without right values."
+    return f"**{_points(exercise.points)}:** {exercise.terms}"
 
 
 def _folded(reference: Reference) -> str:

@@ -40,8 +40,11 @@ STAGE = BOOK / "_stage"
 PUBLISHED = ("*.html", "searchindex.js", "_static/*", "_images/*", "_downloads/*")
 HOW_TO = ("how-to/learners", "how-to/teachers", "how-to/contributors")
 MATHJAX = ("tex-chtml-full.js", "output/chtml/fonts/**/*", "a11y/*", "sre/**/*")
-# The library's modules that decide a kill matrix: it takes minutes, so a new plot must not ask for it again.
-JUDGING = ("cases", "diagnosis", "runner", "validate")
+# The library's modules that no kill matrix depends on: it takes minutes, so a new plot must not ask for it again.
+WITHOUT_A_SAY = (
+    "artefact", "chapters", "check", "checking", "command", "flight", "interactive", "notebook", "plotting", "records", "statistics",
+    "videos",
+)  # fmt: skip
 
 __all__ = ["BookError", "build", "executed_outputs"]
 
@@ -141,6 +144,9 @@ def kill_matrix_page(matrix: dict[str, list[dict]]) -> str:
     for heading, rows in matrix.items():
         lines += [f"## {heading}", ""]
         for row in rows:
+            if "agents" in row:
+                lines += _agents(row)
+                continue
             wrong = [
                 f"| `{w['name']}` | {_plain(w['message'])} | {w['rejected']} | {w['named']} |" for w in row["misconceptions"]
             ]
@@ -152,9 +158,32 @@ def kill_matrix_page(matrix: dict[str, list[dict]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _agents(row: dict) -> list[str]:
+    """The part of the appendix on an exercise that is judged by a file."""
+    low, high = row["thresholds"]
+    table = [
+        f"| {_plain(group['mistake']) or 'trained rightly'} | {group['agents']} |"
+        f" {group['least']:.0f} | {group['middle']:.0f} | {group['most']:.0f} | {group['full']} | {group['half']} |"
+        for group in row["agents"]
+    ]
+    return [
+        f"### `{row['exercise']}`",
+        "",
+        f"Points grow from none at a mean return of {low:g} to all at {high:g}. Mean returns in the grader's {row['episodes']} episodes,"
+        " of agents that differ in the seed of their training:",
+        "",
+        "| Agents | Number | Least | Middle | Most | With all points | With half of them or more |",
+        "|---|---|---|---|---|---|---|",
+        *table,
+        "",
+    ]
+
+
 def kill_rows(chapter: Chapter) -> list[dict]:
     """The chapter's kill matrix, a dict for each exercise, computed on all cores once for each state of what takes part."""
-    library = [COURSE_LIB / f"{module}.py" for module in JUDGING]
+    from autograder import checks  # loads torch, as does all that judges
+
+    library = [path for path in COURSE_LIB.glob("*.py") if path.stem not in WITHOUT_A_SAY]
     own = [path for path in code_inputs(chapter) if not {COURSE_LIB, RUNS} & set(path.parents)]
     cached = (
         cache_folder() / f"{chapter.assignment}-{content_hash([], [*library, *own, ROOT / 'autograder' / 'killmatrix.py'])}.json"
@@ -164,11 +193,28 @@ def kill_rows(chapter: Chapter) -> list[dict]:
             print(
                 f"{chapter.assignment}: testing its checks against wrong and right answers (minutes, the first time)", flush=True
             )
-            names = [str(cell.exercise) for cell in chapter.exercises]
+            names = [exercise.name for exercise in checks.functions(chapter.assignment)]
             with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
                 rows = list(pool.map(_exercise_rows, [chapter.assignment] * len(names), names))
             replace_cached(cached, json.dumps(rows))
-        return json.loads(cached.read_text(encoding="utf-8"))
+        return json.loads(cached.read_text(encoding="utf-8")) + _calibrations(chapter)
+
+
+def _calibrations(chapter: Chapter) -> list[dict]:
+    """The same for the exercises that are judged by a file: the agents on which their thresholds were tried."""
+    from autograder import calibration, checks
+    from autograder.spec import Artefact
+
+    return [
+        {
+            "exercise": artefact.name,
+            "thresholds": artefact.thresholds,
+            "episodes": artefact.episodes,
+            "agents": [dataclasses.asdict(row) for row in calibration.rows(artefact, calibration.groups(artefact))],
+        }
+        for artefact in checks.exercises(chapter.assignment)
+        if isinstance(artefact, Artefact)
+    ]
 
 
 def _exercise_rows(assignment: str, name: str) -> dict:
@@ -177,7 +223,7 @@ def _exercise_rows(assignment: str, name: str) -> dict:
     from autograder import checks, killmatrix
 
     torch.set_num_threads(1)
-    exercise = next(exercise for exercise in checks.exercises(assignment) if exercise.name == name)
+    exercise = next(exercise for exercise in checks.functions(assignment) if exercise.name == name)
     return dataclasses.asdict(killmatrix.exercise_rows(exercise))
 
 

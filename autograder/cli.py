@@ -124,9 +124,11 @@ def grade(
         except (OSError, SQLAlchemyError) as error:  # a full disk, most likely; Python's own exit status would mean low scores
             bar.stop()
             _stop(f"the grades cannot be written: {error}. What is written is whole; mend this and grade again.", BROKEN)
-    from autograder import exports
+    from autograder import exports, verdicts
 
     Console(highlight=False).print(exports.table(results))
+    for line in exports.same_files(verdicts.read_all(out / "verdicts")):  # also of students who are absent this time
+        print(line)
     print(f"Grades are in {out}")
     if any(verdict.status == "infra_error" for verdict in results):
         _stop("some submissions could not be graded (infra_error): grade again; `course doctor` looks for the cause", BROKEN)

@@ -19,7 +19,7 @@ from autograder import paths
 from autograder.chapter import Cell, Chapter, ChapterError, all_chapters
 
 if TYPE_CHECKING:
-    from autograder.spec import Exercise
+    from autograder.spec import Artefact, Exercise
 
 STUB = "raise NotImplementedError"
 
@@ -28,12 +28,12 @@ STUB = "raise NotImplementedError"
 class Sources:
     """What a chapter needs besides its own text."""
 
-    exercises: tuple[Exercise, ...]
+    exercises: tuple[Exercise | Artefact, ...]
     solutions: ModuleType
     references: Path
     pages: Mapping[int, str]  # the chapters that are written, and their pages' names
 
-    def exercise(self, name: str) -> Exercise:
+    def exercise(self, name: str) -> Exercise | Artefact:
         """The checks of one exercise."""
         return next(exercise for exercise in self.exercises if exercise.name == name)
 

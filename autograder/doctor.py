@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
+import numpy as np
 from packaging.requirements import Requirement
 from rich.console import Console
 from rich.table import Table
@@ -33,7 +34,7 @@ class Check:
 
 def checks() -> list[Check]:
     """Looks at everything, the quick things first; a few seconds, most of them for importing torch inside the sandbox."""
-    looks: tuple[Callable[[], Check], ...] = (_python, _packages, _torch, _sandbox, _nbgrader, _frozen, _disk, _browser)
+    looks: tuple[Callable[[], Check], ...] = (_python, _packages, _torch, _sandbox, _flights, _nbgrader, _frozen, _disk, _browser)
     return [look() for look in looks]
 
 
@@ -95,6 +96,19 @@ def _sandbox() -> Check:
     return Check("sandbox", True, f"bubblewrap works as {user}; torch imports inside")
 
 
+def _flights() -> Check:
+    """Whether a file that is handed in could be flown: one episode of a policy that does nothing."""
+    try:
+        from course_lib import flight  # here, because Gymnasium takes a third of a second
+
+        task = flight.TASKS["lander"]
+        idle = {name: np.full(shape, float(name == "obs_std"), np.float32) for name, shape in task.tensors.items()}
+        flight.fly(idle, [0], task)
+    except Exception as error:
+        return Check("flights", False, f"{type(error).__name__}: {error}"[:300], "pip install -r requirements.txt")
+    return Check("flights", True, task.environment)
+
+
 def _nbgrader() -> Check:
     installed = _installed("nbgrader")
     if installed == "missing" or shutil.which("alembic"):
@@ -105,7 +119,7 @@ def _nbgrader() -> Check:
 
 
 def _frozen() -> Check:
-    count = len(list((ROOT / "course_lib" / "frozen").glob("*.npz")))
+    count = len(list((ROOT / "course_lib" / "frozen").glob("*.*")))
     remedy = (
         "" if count else "Nothing to do: `course check` and the first build of the book freeze them, and a bundle has its own."
     )

@@ -59,7 +59,8 @@ def code_inputs(chapter: Chapter) -> list[Path]:
     ]
     checks = [ROOT / "autograder" / name for name in ("spec.py", "freeze.py", f"checks/{chapter.assignment}.py")]
     recorded = [path for name in chapter.experiments for path in (RUNS / name).glob("[!.]*")]
-    return [*library, *recorded, *(ROOT / "solutions").glob("*.py"), *checks, ROOT / "requirements.txt", ROOT / "constraints.txt"]
+    answers = [path for path in (ROOT / "solutions").iterdir() if path.suffix in (".py", ".safetensors")]
+    return [*library, *recorded, *answers, *checks, ROOT / "requirements.txt", ROOT / "constraints.txt"]
 
 
 def content_hash(texts: Iterable[str], files: Iterable[Path]) -> str:
@@ -100,14 +101,16 @@ def _source(chapter: Chapter, cell: Cell) -> str:
 
 
 def _execute(chapter: Chapter) -> NotebookNode:
-    from autograder import checks, freeze  # both load torch, which a build from the cache can do without
+    from autograder import artefacts, checks, freeze  # they load torch, which a build from the cache can do without
 
-    freeze.write(checks.exercises(chapter.assignment), COURSE_LIB / "frozen")
+    exercises = checks.exercises(chapter.assignment)
+    freeze.write(exercises, COURSE_LIB / "frozen")
     cells = _code_cells(chapter)
     notebook = new_notebook(cells=[new_code_cell(_source(chapter, cell), metadata={"tags": sorted(cell.tags)}) for cell in cells])
     print(f"{chapter.assignment}: running {len(cells)} code cells", flush=True)
     started = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="course-book-") as folder:
+        artefacts.hand_in(exercises, Path(folder))
         sockets = str(Path(folder) / "kernel.json")  # a short path, as addresses of local sockets must be
         kernels = AsyncKernelManager(kernel_spec_manager=_ThisPython(), transport="ipc", connection_file=sockets)
         place = {"metadata": {"path": folder}}

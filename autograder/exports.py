@@ -10,7 +10,7 @@ import csv
 import io
 import json
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from autograder.report import STATE_WORDS, STATUS_WORDS, points, report_html
-from autograder.verdicts import Item, Verdict, clean_text, read_all, write_atomically
+from autograder.verdicts import RECEIPT, Item, Verdict, clean_text, read_all, write_atomically
 
 if TYPE_CHECKING:
     from autograder.gradebook import GradebookWriter
@@ -184,7 +184,7 @@ def _overview(verdict: Verdict) -> tuple[str, str, str, str, str]:
     outcome = [f"{count} {state}" for state, count in states.items()]
     if verdict.status == "student_error":  # nothing ran, and one reason holds for all: a teacher can act on that, not on counts
         outcome = list(dict.fromkeys(item.message for item in verdict.automatic if item.message))
-    notes = "; ".join([*outcome, *verdict.flags])
+    notes = "; ".join([*outcome, *(flag for flag in verdict.flags if not flag.startswith(RECEIPT))])
     return verdict.student, verdict.assignment, verdict.status.replace("_", " "), score, clean_text(notes.replace("\n", " "), 300)
 
 
@@ -201,6 +201,20 @@ def table(verdicts: Iterable[Verdict | Mapping[str, Any]]) -> Table:
         cells[2].stylize(_STATUS_STYLES[verdict.status])
         result.add_row(*cells)
     return result
+
+
+def same_files(verdicts: Iterable[Verdict]) -> list[str]:
+    """A line for each file that several students have handed in byte for byte: worth a word with them, and no more than that."""
+    owners: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for verdict in verdicts:
+        for flag in verdict.flags:
+            if flag.startswith(RECEIPT):
+                owners[verdict.assignment, flag.removeprefix(RECEIPT)].append(verdict.student)
+    return [
+        f"{assignment}: the same {receipt.partition(' ')[0]} was handed in by {', '.join(students)}"
+        for (assignment, receipt), students in sorted(owners.items())
+        if len(students) > 1
+    ]
 
 
 def summary_markdown(verdicts: Iterable[Verdict | Mapping[str, Any]], rows: int = 1000) -> str:

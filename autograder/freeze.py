@@ -12,7 +12,9 @@ from typing import Any
 
 import torch
 
-from autograder.spec import Case, Exercise
+from autograder import artefacts
+from autograder.spec import Artefact, Case, Exercise
+from course_lib import artefact as files
 from course_lib.cases import FrozenCase, FrozenExercise, Observation, save
 from course_lib.diagnosis import differing_facets, signature, view
 from course_lib.runner import observe
@@ -34,11 +36,14 @@ def complete(exercise: Exercise, seed: int = 0) -> FrozenExercise:
     return _exercise(exercise, visible(exercise, seed).cases + hidden)
 
 
-def write(exercises: Iterable[Exercise], directory: Path) -> None:
-    """Write `directory/NAME.npz` with the visible cases of each exercise."""
+def write(exercises: Iterable[Exercise | Artefact], directory: Path) -> None:
+    """Write `directory/NAME.npz` with the visible cases of each exercise; NAME.json where it is judged by a file."""
     directory.mkdir(parents=True, exist_ok=True)
     for exercise in exercises:
-        save(directory / f"{exercise.name}.npz", visible(exercise))
+        if isinstance(exercise, Artefact):
+            files.save(directory / f"{exercise.name}.json", artefacts.visible(exercise))
+        else:
+            save(directory / f"{exercise.name}.npz", visible(exercise))
 
 
 def _exercise(exercise: Exercise, cases: list[FrozenCase]) -> FrozenExercise:

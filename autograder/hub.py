@@ -9,21 +9,26 @@ import contextlib
 import functools
 import io
 from collections.abc import Callable
+from pathlib import Path
 
-from autograder import checks, freeze
+from autograder import artefacts, checks, freeze
+from autograder.spec import Artefact
+from course_lib.artefact import FrozenArtefact, judge_here
 from course_lib.cases import FrozenExercise
 from course_lib.diagnosis import examine
 
 
 def score(name: str, function: Callable) -> float:
-    """The points that `function` earns as the exercise `name`, all cases included.
+    """The points that `function` earns as the exercise `name`, all cases included; or the file beside the notebook, if that is judged.
 
     nbgrader takes a cell's number as partial credit. Nothing is printed: anything on stderr would cost the learner all points.
     """
     with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
-        return examine(_frozen(name), function).score
+        frozen = _frozen(name)
+        return (judge_here(frozen, Path()) if isinstance(frozen, FrozenArtefact) else examine(frozen, function)).score
 
 
 @functools.cache
-def _frozen(name: str) -> FrozenExercise:
-    return next(freeze.complete(exercise) for exercise in checks.all_exercises() if exercise.name == name)
+def _frozen(name: str) -> FrozenExercise | FrozenArtefact:
+    exercise = next(exercise for exercise in checks.all_exercises() if exercise.name == name)
+    return artefacts.hidden(exercise) if isinstance(exercise, Artefact) else freeze.complete(exercise)

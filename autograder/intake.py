@@ -44,6 +44,10 @@ class BadNotebook(ValueError):
     """The notebook cannot be read; the message says why, to the learner."""
 
 
+class BadFile(ValueError):
+    """A file cannot be read; the message goes on from its name, to the learner."""
+
+
 def discover(submitted: Path) -> list[tuple[str, str, Path]]:
     """Every (student, assignment, folder) under `submitted`, sorted; names that begin with a dot are no submissions."""
     return [
@@ -75,13 +79,15 @@ def read(student: str, assignment: str, folder: Path) -> Submission:
         submission.problem = "The submission's folder is a link; hand in the files themselves."
         return submission
     try:
-        submission.notebook = parse(_read_regular(folder / f"{folder.name}.ipynb", MAX_NOTEBOOK))
+        submission.notebook = parse(read_regular(folder / f"{folder.name}.ipynb", MAX_NOTEBOOK))
     except FileNotFoundError:
         found = sorted(entry.name for entry in folder.glob("*.ipynb"))[:3]
         others = f" (found: {', '.join(found)})" if found else ""
         submission.problem = f"There is no notebook {assignment}.ipynb in the submission{others}."
     except BadNotebook as problem:
         submission.problem = str(problem)
+    except BadFile as problem:
+        submission.problem = f"{assignment}.ipynb {problem}."
     except OSError as error:
         submission.problem = f"{assignment}.ipynb can't be read: {error.strerror}."
     _collect(folder, submission)
@@ -131,19 +137,22 @@ def grade_ids(notebook: nbformat.NotebookNode) -> Counter[str]:
     return Counter(name for name in ids if isinstance(name, str))
 
 
-def _read_regular(path: Path, limit: int) -> bytes:
+def read_regular(path: Path, limit: int) -> bytes:
+    """The content of a regular file of at most `limit` bytes, nothing else being opened. Raises BadFile; OSError, if it can't be read."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError as error:
         if path.is_symlink():
-            raise BadNotebook(f"{path.name} is a link; hand in the file itself.") from None
+            raise BadFile("is a link; hand in the file itself") from None
         raise error
+    status = os.fstat(descriptor)
+    if not stat.S_ISREG(status.st_mode):
+        os.close(descriptor)
+        raise BadFile("is not a regular file")
     with os.fdopen(descriptor, "rb") as file:
-        status = os.fstat(file.fileno())
-        if not stat.S_ISREG(status.st_mode):
-            raise BadNotebook(f"{path.name} is not a regular file.")
         if status.st_size > limit:
-            raise BadNotebook(f"{path.name} is larger than {limit >> 20} MB: clear its outputs and save it again.")
+            allowed = f"{limit >> 20} MB: clear its outputs and save it again" if limit == MAX_NOTEBOOK else f"{limit >> 10} kB"
+            raise BadFile(f"is larger than {allowed}")
         return file.read(limit + 1)
 
 

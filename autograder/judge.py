@@ -20,10 +20,12 @@ from typing import Any
 import numpy as np
 
 import course_lib
-from autograder import assemble, chapter, checks, freeze, intake
+from autograder import artefacts, assemble, chapter, checks, freeze, intake
 from autograder.paths import ROOT
 from autograder.sandbox import Sandbox, SandboxDied, SandboxError, SandboxGarbage, SandboxTimeout
+from autograder.spec import Artefact
 from autograder.verdicts import Item, Verdict, clean_text
+from course_lib.artefact import FrozenArtefact
 from course_lib.cases import FrozenExercise, Observation, decode, encode
 from course_lib.diagnosis import Finding, diagnose, view
 from course_lib.notebook import is_check, is_live
@@ -45,7 +47,7 @@ class Released:
     """What the judge knows of an assignment, all of it from the release and nothing from a submission."""
 
     assignment: str
-    exercises: tuple[FrozenExercise, ...]
+    exercises: tuple[FrozenExercise | FrozenArtefact, ...]
     open_questions: tuple[tuple[str, float], ...]
     grade_ids: frozenset[str]
     live_sources: frozenset[str]
@@ -72,7 +74,10 @@ def released(assignment: str) -> Released:
 def _released(assignment: str) -> Released:
     page = chapter.load(assignment)
     outline = assemble.assignment(page)
-    exercises = tuple(freeze.complete(exercise) for exercise in checks.exercises(assignment))
+    exercises = tuple(
+        artefacts.hidden(exercise) if isinstance(exercise, Artefact) else freeze.complete(exercise)
+        for exercise in checks.exercises(assignment)
+    )
     names = {exercise.name for exercise in exercises}
     tests = {f"test_{name}" for name in names}
     questions = {name for name, _ in outline.open_questions}
@@ -124,8 +129,13 @@ def judge(submission: intake.Submission, release: Released, timeout: float = 60.
         tampered = tampering(submission.notebook, release)
         flags += tampered
         run = _Run(submission, release, timeout, trusted)
-        findings = run.findings()
+        found = run.findings()
         flags += run.flags
+        for artefact in release.exercises:
+            if isinstance(artefact, FrozenArtefact):
+                found[artefact.name], receipts = artefacts.judge(artefact, submission.folder, timeout)
+                flags = receipts + flags  # first, as the list of flags is cut at its end
+        findings = [found[exercise.name] for exercise in release.exercises]
         status = "needs_review" if tampered else "graded"
     items = [Item(f.exercise, f.score, f.max_score, f.state, tuple(f.misconceptions), clean_text(f.message)) for f in findings]
     items += [Item(name, 0.0, points, "manual") for name, points in release.open_questions]
@@ -192,14 +202,16 @@ class _Run:
     trusted: bool
     flags: list[str] = field(default_factory=list)
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> dict[str, Finding]:
+        """What was found for every exercise that is judged by calling it, by name."""
+        exercises = [exercise for exercise in self.release.exercises if isinstance(exercise, FrozenExercise)]
         self._cells = runnable(self.submission.notebook, self.release)
         self._loading_failures: dict[str, str] = {}
         self._reserved = 0
         self._apart = False  # each exercise in a sandbox of its own, with the cells up to its definition and none after it
-        self._deadline = time.monotonic() + (len(self.release.exercises) + 1) * self.timeout + SLACK_SECONDS
+        self._deadline = time.monotonic() + (len(exercises) + 1) * self.timeout + SLACK_SECONDS
         found: dict[str, Finding] = {}
-        pending = list(self.release.exercises)
+        pending = list(exercises)
         while pending and time.monotonic() < self._deadline:
             with self._sandbox() as sandbox:
                 self._wait_until_ready(sandbox)
@@ -221,7 +233,7 @@ class _Run:
                         break
                     if self._apart:
                         break
-        return [found.get(exercise.name) or self._timed_out(exercise) for exercise in self.release.exercises]
+        return {exercise.name: found.get(exercise.name) or self._timed_out(exercise) for exercise in exercises}
 
     @contextmanager
     def _sandbox(self) -> Iterator[Sandbox]:

@@ -26,7 +26,7 @@ from autograder.chapter import ANSWER_LINE, Chapter
 from autograder.contract import STUB, Sources
 from autograder.contract import sources as real_sources
 
-LEARNERS_NEED = {"torch", "numpy", "matplotlib", "ipywidgets", "gymnasium", "safetensors", "pyarrow", "tqdm"}
+LEARNERS_NEED = {"torch", "numpy", "matplotlib", "ipywidgets", "gymnasium[box2d]", "safetensors", "pyarrow", "tqdm"}
 RECORDED = {".parquet", ".mp4", ".webp"}  # not policies: one could be handed in
 MANIFEST = ".release.json"
 
@@ -123,7 +123,7 @@ def _library(chosen: list[Chapter], sources: Callable[[Chapter], Sources]) -> di
 def _pyproject() -> str:
     """The library's own project file: our pins as lower bounds, as a learner's Jupyter brings versions of its own."""
     pins = re.findall(r"^([\w-]+)(?:\[.*\])?==(\S+)", (paths.ROOT / "requirements.txt").read_text(encoding="utf-8"), re.MULTILINE)
-    needed = [f"{name}>={version}" for name, version in pins if name in LEARNERS_NEED]
+    needed = [f"{need}>={version}" for name, version in pins for need in LEARNERS_NEED if need.partition("[")[0] == name]
     project = tomllib.loads((paths.ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     python = project["requires-python"].split(",")[0]
     return _PYPROJECT.format(version=project["version"], python=python, dependencies=json.dumps(needed))

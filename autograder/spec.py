@@ -1,4 +1,4 @@
-"""What a chapter's checks are made of: exercises, cases, misconceptions and correct variants, as data.
+"""What a chapter's checks are made of: exercises, cases, misconceptions and correct variants, as data; and files to be flown.
 
 A chapter's module `autograder/checks/chNN.py` has one tuple, `EXERCISES`. The same cases run in the learner's notebook (those that
 are visible, frozen to arrays), in the judge, in the tests, and in the book's kill matrix.
@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from course_lib.cases import FrozenCase
+from course_lib.cases import FACET_TEXT, FrozenCase
 
 Inputs = Callable[[torch.Generator], dict[str, Any]]
 
@@ -82,3 +82,46 @@ class Exercise:
     @property
     def points(self) -> float:
         return round(sum(self.criteria.values()), 6)
+
+    @property
+    def terms(self) -> str:
+        """What the points are for, as the notebook says it."""
+        shares = ", ".join(f"{points:g} if it {FACET_TEXT[name]}" for name, points in self.criteria.items())
+        return f"{shares}. Nothing is paid without right values."
+
+
+@dataclass(frozen=True)
+class Artefact:
+    """An exercise whose points come from a file that is handed in beside the notebook: the weights of a trained policy.
+
+    It stands in EXERCISES and has a stub in its chapter like any other, but what the stub's function does is never looked at: the grader
+    flies `file` as the task `task` (course_lib.flight.TASKS) from `episodes` seeds that nobody has seen, learners from
+    `visible_episodes` others. `thresholds` are the mean returns that earn nothing and everything. The file that the reference made lies
+    in solutions/.
+    """
+
+    name: str
+    reference: Callable
+    file: str
+    task: str
+    points: float
+    thresholds: tuple[float, float]
+    episodes: int = 100
+    visible_episodes: int = 20
+    experiment: str = ""  # whose agents show that the thresholds are right: autograder.calibration
+    right: str = "ours"  # its variant that was trained rightly; those whose configuration names a `mistake` were not
+
+    @property
+    def criteria(self) -> dict[str, float]:
+        """All points are for one thing."""
+        return {"flight": self.points}
+
+    @property
+    def terms(self) -> str:
+        """What the points are for, as the notebook says it."""
+        low, high = self.thresholds
+        return (
+            f"for the file `{self.file}`, handed in beside the notebook. The grader flies it, without noise, for {self.episodes} episodes"
+            f" that start from seeds of its own: no points up to a mean return of {low:g}, all of them from {high:g} on, and in between a"
+            " share that grows in proportion. The file alone counts, not the function that wrote it."
+        )

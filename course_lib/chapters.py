@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from course_lib.checking import check
+from course_lib.checking import check, is_judged_by_file
 from course_lib.notebook import code_cells, new_namespace, run_cells
 
 REFERENCES = "COURSE_REFERENCES"
@@ -54,6 +54,8 @@ def _function(name: str, chapter: int) -> Callable:
     if not callable(namespace.get(name)):
         stopped = "; ".join(f"code cell {i + 1} stops: {type(error).__name__}: {error}" for i, error in failures.items())
         raise LookupError(f"{path} defines no function {name}{f' ({stopped})' if stopped else ''}")
+    if is_judged_by_file(name):  # its check looks at a file beside that notebook, and says nothing about the function
+        return namespace[name]
     result = check(namespace[name])
     if not result.passed:
         raise LookupError(f"{name} in {path} does not pass its check yet; repair it there first:\n{result}")

@@ -9,7 +9,7 @@ import os
 import sys
 from pathlib import Path
 
-from course_lib.checking import check, exercise_names
+from course_lib.checking import check, check_file, exercise_names, is_judged_by_file
 from course_lib.notebook import NotebookError, code_cells, new_namespace, run_cells
 
 
@@ -37,10 +37,13 @@ def main(arguments: list[str]) -> int:
         print(f"! code cell {position + 1} stopped: {type(failure).__name__}: {failure}")
     passed = 0
     for name in wanted:
-        if not callable(namespace.get(name)):
+        if is_judged_by_file(name):
+            result = check_file(name)
+        elif callable(namespace.get(name)):
+            result = check(namespace[name])
+        else:
             print(f"✗ {name}: the notebook defines no function of this name")
             continue
-        result = check(namespace[name])
         print(result)
         passed += result.passed
     print(f"{passed} of {len(wanted)} pass")

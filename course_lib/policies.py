@@ -8,9 +8,8 @@ what `policy(obs)` returns, call `backward()`, and the gradient is in `policy.we
 
 from __future__ import annotations
 
-import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -48,6 +47,10 @@ def tensor_shapes(obs_dim, action_dim, discrete=False, hidden=64) -> dict[str, t
     return shapes if discrete else shapes | {"log_std": (action_dim,)}
 
 
+LANDER_SHAPES = tensor_shapes(**LANDER) | {"obs_mean": (8,), "obs_std": (8,)}
+"""The tensors of a lander's file, all float32."""
+
+
 @dataclass(eq=False)
 class ActorCritic:
     """Two networks of two hidden layers (tanh), one for the actions' distribution, one for the value; make one with `make_policy`.
@@ -69,6 +72,11 @@ class ActorCritic:
         self.arrays = self.unflatten(self.weights.detach().numpy())  # views: they follow the vector
         self.gradient = np.zeros_like(self.weights.detach().numpy())
         self.gradients = self.unflatten(self.gradient)
+
+    def __deepcopy__(self, memo) -> ActorCritic:
+        """A policy of its own: plain copying would lose that the arrays are views on the weights."""
+        weights = self.weights.detach().clone().requires_grad_()
+        return replace(self, weights=weights, obs_mean=self.obs_mean.clone(), obs_std=self.obs_std.clone())
 
     def __call__(self, obs) -> tuple[Gaussian | Categorical, torch.Tensor]:
         """The distribution of actions in each state, and the values (...,); both pass gradient to `weights`."""
@@ -239,7 +247,7 @@ def save_policy(policy, path) -> None:
     """Write a policy as a safetensors file: its parameters by name, `obs_mean` and `obs_std`."""
     tensors = {name: tensor.clone() for name, tensor in policy.tensors().items()}
     tensors |= {"obs_mean": policy.obs_mean, "obs_std": policy.obs_std}
-    safetensors.torch.save_file(tensors, Path(path), metadata={"discrete": json.dumps(policy.discrete)})
+    safetensors.torch.save_file(tensors, Path(path))
 
 
 def load_policy(path) -> ActorCritic:
@@ -272,3 +280,5 @@ def copy_tensors(policy, tensors, source) -> None:
         if tensor.dtype != torch.float32 or not tensor.isfinite().all():
             raise ValueError(f"{source}: {name} must hold finite float32 numbers, got {tensor.dtype}")
         targets[name].copy_(tensor)
+    if not (policy.obs_std > 0).all():
+        raise ValueError(f"{source}: obs_std must be positive, got {policy.obs_std.tolist()}")

@@ -43,6 +43,23 @@ class PPOSettings:
 ZOO_SETTINGS = PPOSettings()
 """For LunarLanderContinuous, with 16 environments: those of rl-baselines3-zoo, whose rollouts are 16 times 1024 steps."""
 
+LANDER_SETTINGS = PPOSettings(
+    num_steps=256,
+    minibatch_size=512,
+    num_epochs=10,
+    learning_rate=1e-3,
+    anneal=True,
+    ent_coef=0.0,
+    reward_scale=0.05,
+    log_std=-0.5,
+)
+"""For LunarLanderContinuous, with 16 environments: our own, which land within 400,000 steps.
+
+What differs from the zoo's and why: a quarter of the steps in a rollout, so that there are four times as many updates; rewards
+scaled so that the critic's targets are of the order of 10, not 200; larger minibatches, which make a step cheaper, with a larger
+learning rate, which falls to 0; and a smaller first standard deviation, with no bonus that keeps it up.
+"""
+
 
 @dataclass(frozen=True)
 class Batch:

@@ -163,7 +163,9 @@ def _changed(given: dict[str, Any], before: dict[str, torch.Tensor]) -> list[str
 
 
 def _same(new: torch.Tensor, old: torch.Tensor) -> bool:
-    return new.dtype == old.dtype and new.shape == old.shape and torch.equal(new.nan_to_num(), old.nan_to_num())
+    if new.dtype != old.dtype or new.shape != old.shape:
+        return False
+    return torch.equal(new, old) or torch.equal(new.nan_to_num(), old.nan_to_num())
 
 
 def text_of(error: BaseException) -> str:

@@ -100,8 +100,8 @@ def collect_rollout(envs, policy, num_steps, obs, generator):
         obs, rewards, terminated, truncated, info = envs.step(clipped)
         steps.append((before, actions, rewards, true_next_obs(obs, info), terminated, truncated))
     columns = [torch.as_tensor(np.stack(column)) for column in zip(*steps, strict=True)]
-    columns = [column.float() if column.is_floating_point() else column for column in columns]
-    return Rollout(*columns, torch.as_tensor(obs, dtype=torch.float32))
+    columns.append(torch.as_tensor(obs))
+    return Rollout(*(column.float() if column.is_floating_point() else column for column in columns))
 
 
 def minibatches(batch_size, minibatch_size, generator):
@@ -294,38 +294,53 @@ def fast_ppo_update(policy, optimizer, batch, settings, generator):
         ∂L/∂log π = -ρ A / B where the clip does not bind, else 0
         ∂L/∂V = 2 c_v (V - R) / B,   ∂L/∂H = -c_e
 
-    The rest is the chain rule through log π and H, in `gaussian_head` and
-    `categorical_head`, and through the networks, in `policy.backward`.
+    The first is in `clipped_surrogate_gradient`; the chain rule through log π and H in
+    `gaussian_head` and `categorical_head`, through the networks in `policy.backward`.
 
     Args, returns: as ppo_update.
     """
     columns = [column.numpy() for column in (batch.obs, batch.actions, batch.old_log_probs, batch.advantages, batch.returns)]
     columns[0] = policy.normalize(columns[0])
     head = categorical_head if policy.discrete else gaussian_head
-    low, high = 1 - settings.clip_range, 1 + settings.clip_range
-    history = []
+    history: list[list[float]] = []
     policy.weights.grad = torch.from_numpy(policy.gradient)  # one memory: what `backward` writes is what `step` reads
     for _ in range(settings.num_epochs):
         epoch = []
         for indices in minibatches(len(batch), settings.minibatch_size, generator):
-            obs, actions, old_log_probs, advantages, returns = (column[indices.numpy()] for column in columns)
+            rows = indices.numpy()
+            obs, actions, old_log_probs, advantages, returns = (column[rows] for column in columns)
             actor, critic = policy.forward("actor", obs), policy.forward("critic", obs)
             log_probs, entropy, pull_back = head(policy, actor[-1], actions)
-            log_ratio, errors = log_probs - old_log_probs, critic[-1][:, 0] - returns
-            ratio = np.exp(log_ratio)
-            gains, clipped_gains = ratio * advantages, np.minimum(np.maximum(ratio, low), high) * advantages
-            outputs_gradient = pull_back(np.where(gains <= clipped_gains, gains, 0) / -len(gains), -settings.ent_coef)
-            policy.backward("actor", actor, outputs_gradient)
-            policy.backward("critic", critic, (2 * settings.vf_coef / len(errors)) * errors[:, None])
+            (policy_loss, approx_kl, clip_fraction), d_log_probs = clipped_surrogate_gradient(
+                log_probs, old_log_probs, advantages, settings.clip_range
+            )
+            errors = critic[-1] - returns[:, None]
+            policy.backward("actor", actor, pull_back(d_log_probs, -settings.ent_coef))
+            policy.backward("critic", critic, (2 * settings.vf_coef / len(errors)) * errors)
             optimizer.step(policy, settings.max_grad_norm)
-            outside = np.count_nonzero(np.abs(ratio - 1) > settings.clip_range)
-            sums = -np.minimum(gains, clipped_gains).sum(), errors @ errors, (ratio - 1 - log_ratio).sum(), outside
-            epoch.append((sums[0], sums[1], entropy * len(gains), sums[2], sums[3]) / np.float32(len(gains)))
+            epoch.append([policy_loss, np.vdot(errors, errors) / len(errors), entropy, approx_kl, clip_fraction])
         history += epoch
         if np.mean([metrics[3] for metrics in epoch]) > settings.target_kl:
             break
     names = "policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction"
-    return dict(zip(names, torch.as_tensor(np.mean(history, axis=0)), strict=True))
+    return dict(zip(names, torch.from_numpy(np.mean(history, axis=0, dtype=np.float32)), strict=True))
+
+
+def clipped_surrogate_gradient(log_probs, old_log_probs, advantages, clip_range):
+    """The clipped surrogate loss, and its derivative by log_probs, on arrays (B,).
+
+    Where the minimum picks the clipped term, the ratio has left the interval, and the
+    term is a constant; elsewhere ∂(ρ A) / ∂log π = ρ A.
+
+    Returns: ((policy_loss, approx_kl, clip_fraction), derivative (B,)).
+    """
+    log_ratio = log_probs - old_log_probs
+    ratio = np.exp(log_ratio)
+    gains, share = ratio * advantages, 1 / len(ratio)
+    clipped_gains = np.minimum(np.maximum(ratio, 1 - clip_range), 1 + clip_range) * advantages
+    outside = np.count_nonzero(np.abs(ratio - 1) > clip_range)
+    metrics = -share * np.minimum(gains, clipped_gains).sum(), share * (ratio - 1 - log_ratio).sum(), share * outside
+    return metrics, np.where(gains <= clipped_gains, gains, 0) * -share
 
 
 def gaussian_head(policy, mean, actions):

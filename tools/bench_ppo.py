@@ -117,7 +117,7 @@ def main():
             f"{1e6 / together:.0f}",
             f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})",
         )
-    Console().print(table)
+    Console(width=100).print(table)
     if arguments.record:
         packages = ("stable-baselines3", "torch", "numpy", "gymnasium")
         record = {

@@ -5,15 +5,20 @@ from __future__ import annotations
 import importlib
 import pkgutil
 
-from autograder.spec import Exercise
+from autograder.spec import Artefact, Exercise
 
 
-def exercises(assignment: str) -> tuple[Exercise, ...]:
+def exercises(assignment: str) -> tuple[Exercise | Artefact, ...]:
     """The exercises of assignment "chNN", in the chapter's order. Raises ModuleNotFoundError if it has none."""
     return importlib.import_module(f"{__name__}.{assignment}").EXERCISES
 
 
-def all_exercises() -> list[Exercise]:
+def functions(assignment: str) -> list[Exercise]:
+    """Those of them that are judged by calling a function."""
+    return [exercise for exercise in exercises(assignment) if isinstance(exercise, Exercise)]
+
+
+def all_exercises() -> list[Exercise | Artefact]:
     """The exercises of every chapter."""
     names = sorted(module.name for module in pkgutil.iter_modules(__path__))
     return [exercise for name in names for exercise in exercises(name)]

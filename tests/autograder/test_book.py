@@ -151,12 +151,22 @@ def test_kill_matrix_shows_messages_as_they_are_written():
     assert "| loop | 3 |" in page
 
 
+def test_kill_matrix_shows_the_agents_behind_the_thresholds_of_a_file():
+    row = {"variant": "x", "agents": 20, "least": 201.4, "middle": 250.0, "most": 271.8, "full": 20, "half": 20, "chance": 0.004}
+    agents = [row | {"mistake": ""}, row | {"mistake": "It descends | the hill.", "full": 0, "half": 1}]
+    flown = {"exercise": "train", "thresholds": (0.0, 200.0), "episodes": 100, "agents": agents}
+    page = book.kill_matrix_page({"99. Tiny": [flown]})
+    assert "Points grow from none at a mean return of 0 to all at 200." in page and "the grader's 100 episodes" in page
+    assert "| trained rightly | 20 | 201 | 250 | 272 | 20 | 20 |" in page
+    assert r"| It descends \| the hill. | 20 | 201 | 250 | 272 | 0 | 1 |" in page
+
+
 def test_kill_matrix_is_keyed_on_all_modules_that_decide_it():
     imports = "import sys, autograder.killmatrix, autograder.checks as checks; checks.all_exercises()"
     loaded = f"{imports}; print(*(name for name in sys.modules if name.startswith('course_lib.')))"
     output = subprocess.run([sys.executable, "-c", loaded], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    used = {name.removeprefix("course_lib.") for name in output.split()} - {"checking"}  # loaded by the package, and not used
-    assert used <= set(book.JUDGING)
+    used = {name.removeprefix("course_lib.") for name in output.split()} & set(book.WITHOUT_A_SAY)
+    assert used <= {"artefact", "chapters", "checking", "flight", "notebook"}  # loaded by the package, or by what freezes
 
 
 def test_staging_touches_changed_files_only_and_removes_what_has_gone(tmp_path):

@@ -12,7 +12,7 @@ from autograder.doctor import Check
 def test_this_machine_works():
     found = {check.name: check for check in doctor.checks()}
     assert [check for check in found.values() if check.required and not check.ok] == []
-    assert list(found) == ["Python", "packages", "torch", "sandbox", "nbgrader", "frozen checks", "disk", "browser"]
+    assert list(found) == ["Python", "packages", "torch", "sandbox", "flights", "nbgrader", "frozen checks", "disk", "browser"]
     assert all(check.ok or check.remedy for check in found.values())
 
 
@@ -44,6 +44,12 @@ def test_a_build_label_does_not_make_another_version():
 def test_a_broken_sandbox_is_reported_with_its_remedy(monkeypatch):
     monkeypatch.setattr(sandbox, "probe", lambda torch: [sandbox.Problem("no sandbox", "apt install bubblewrap")])
     assert doctor._sandbox() == Check("sandbox", False, "no sandbox", "apt install bubblewrap")
+
+
+def test_a_missing_engine_is_reported(monkeypatch):
+    monkeypatch.setattr("gymnasium.make", lambda *_, **__: 1 / 0)
+    check = doctor._flights()
+    assert not check.ok and "ZeroDivisionError" in check.detail and check.remedy
 
 
 @pytest.mark.parametrize("look", [doctor._nbgrader, doctor._browser])

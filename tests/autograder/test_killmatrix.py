@@ -5,13 +5,14 @@ import pytest
 from autograder import book, chapter, checks, killmatrix
 from course_lib.cases import FACETS
 
-EXERCISES = checks.all_exercises()
+PAGES = chapter.all_chapters()
+EXERCISES = [exercise for page in PAGES for exercise in checks.functions(page.assignment)]
 AT_LEAST_EIGHT = {"compute_gae", "clipped_surrogate_loss", "bradley_terry_loss", "reward_model_loss", "dpo_loss"}
 
 
 @pytest.mark.parametrize(
     ("page", "name"),
-    [(page, exercise.name) for page in chapter.all_chapters() for exercise in checks.exercises(page.assignment)],
+    [(page, exercise.name) for page in PAGES for exercise in checks.functions(page.assignment)],
     ids=lambda value: value if isinstance(value, str) else value.assignment,
 )
 def test_every_misconception_is_rejected_and_named_and_every_variant_accepted(page, name):

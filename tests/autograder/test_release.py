@@ -160,7 +160,7 @@ def test_the_library_installs_with_its_frozen_checks_and_without_the_project(bun
     ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert ran.stdout.strip() == f"{tmp_path}/course_lib/checking.py ['double', 'quadruple']"
     metadata = next(tmp_path.glob("course_lib-*.dist-info/METADATA")).read_text()
-    assert set(re.findall(r"Requires-Dist: ([\w-]+)>=", metadata)) == release.LEARNERS_NEED
+    assert set(re.findall(r"Requires-Dist: ([\w-]+(?:\[.*\])?)>=", metadata)) == release.LEARNERS_NEED
 
 
 def test_no_line_of_a_tiny_solution_and_no_name_of_the_judge_is_in_the_bundle(bundle):

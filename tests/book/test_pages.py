@@ -77,6 +77,13 @@ def test_equations_are_rendered_and_begin_where_a_phone_can_show_them(browser, h
         assert visit.page.locator("span.math:not(:has(mjx-container)), div.math:not(:has(mjx-container))").count() == 0
 
 
+@pytest.mark.parametrize("name", CHAPTERS)
+def test_no_equation_is_wider_than_its_column(browser, html, name):
+    with Visit(browser, html / f"{name}.html") as visit:
+        cut = "all => all.filter(one => one.scrollWidth > one.clientWidth).map(one => one.id || one.innerText)"
+        assert visit.page.locator("div.math").evaluate_all(cut) == [], "break it into lines (aligned): its number is cut off"
+
+
 @pytest.mark.parametrize("chapter", all_chapters(), ids=_id)
 def test_sliders_moved_by_keyboard_show_the_librarys_own_values(browser, html, chapter):
     with Visit(browser, html / f"{docname(chapter)}.html") as visit:

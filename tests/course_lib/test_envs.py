@@ -5,7 +5,7 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 
-from course_lib.envs import BalanceTask, ChainVectorEnv
+from course_lib.envs import BalanceTask, ChainVectorEnv, TimerVectorEnv, make
 
 
 def quiet(**options):
@@ -153,3 +153,34 @@ def test_an_unstable_controller_earns_next_to_nothing_and_stays_finite():
 def test_balance_refuses_discounts_without_a_finite_sum(gamma):
     with pytest.raises(ValueError, match=f"gamma must lie in .*{gamma}"):
         BalanceTask(gamma=gamma)
+
+
+def test_made_environments_reset_in_the_same_step_show_the_true_end_and_draw_nothing():
+    envs = make("CartPole-v1", 2, max_episode_steps=3)
+    assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP and envs.envs[0].render_mode is None
+    envs.reset(seed=0)
+    _, second, third = (envs.step(np.ones(2, dtype=int)) for _ in range(3))
+    assert third[3].all() and not second[3].any()
+    assert (np.stack(third[4]["final_obs"])[:, 1] > second[0][:, 1]).all() and (np.abs(third[0]) < 0.06).all()
+
+
+def test_environments_of_one_vector_differ_and_one_seed_decides_them():
+    first, again, other = (make("CartPole-v1", 3).reset(seed=seed)[0] for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, again)
+    assert len(np.unique(first[:, 0])) == 3 and not (first == other).any()
+
+
+def test_timers_end_when_and_as_told():
+    envs = TimerVectorEnv(lengths=(1, 2), terminates=(True, False), action_reward=0.5)
+    assert envs.observation_space.contains(envs.reset(seed=0)[0])
+    first, second = (envs.step(np.array([[0.0], [1.0]])) for _ in range(2))
+    assert (first[0].tolist(), first[2].tolist(), first[3].tolist()) == ([[0], [1]], [True, False], [False, False])
+    assert first[4]["final_obs"].tolist() == [[1], [1]] and first[4]["_final_obs"].tolist() == [True, False]
+    assert (second[0].tolist(), second[2].tolist(), second[3].tolist()) == ([[0], [0]], [True, False], [False, True])
+    assert first[1].tolist() == [1, 1.5]
+
+
+@pytest.mark.parametrize("options", [{"lengths": (3,)}, {"lengths": (0, 3)}, {"terminates": (True,) * 3}])
+def test_timers_refuse_impossible_lengths(options):
+    with pytest.raises(ValueError, match="lengths"):
+        TimerVectorEnv(**options)

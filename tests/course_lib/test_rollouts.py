@@ -6,8 +6,8 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 
-from course_lib.envs import ChainVectorEnv
-from course_lib.rollouts import collect
+from course_lib.envs import ChainVectorEnv, TimerVectorEnv
+from course_lib.rollouts import EpisodeReturns, collect
 
 
 def always(action):
@@ -53,3 +53,12 @@ def test_next_step_autoreset_is_refused():
     envs = gym.make_vec("CartPole-v1", 2, vectorization_mode="sync")
     with pytest.raises(ValueError, match="same-step autoreset"):
         collect(envs, always(1), 2, np.zeros((2, 4)))
+
+
+def test_returns_of_episodes_add_up_across_rollouts():
+    envs, returns = TimerVectorEnv(lengths=(3, 4), terminates=(True, False)), EpisodeReturns(2)
+    obs, seen = envs.reset(seed=0)[0], []
+    for _ in range(4):
+        rollout, obs = collect(envs, lambda obs: torch.zeros(2, 1), 2, obs)
+        seen.append(returns.add(rollout))
+    assert seen == [[], [3, 4], [3], [4]]

@@ -1,0 +1,126 @@
+"""Where the thresholds of an exercise that is judged by a file come from: agents trained rightly and wrongly, flown as the judge flies.
+
+The bar: of right agents, at most one in a hundred earns less than all points; of wrong ones, at most one in a hundred earns half of
+them. A student's luck is the seed of a training, since the judge's episodes are the same for all. Twenty agents cannot show
+a hundredth by counting, so the chance that a further agent crosses a mark is taken to be the larger of two estimates:
+
+- bootstrap: draw one of the agents, and as many of its episodes as the judge flies, with replacement; how often does the mean cross?
+  It keeps the shape of what was seen, and counts the luck of the episodes as if the judge drew new ones;
+- prediction: a further agent's mean return, if those of agents are normal, is mean + deviation √(1 + 1/n) t with n - 1 degrees of
+  freedom. It counts the luck of the trainings, beyond the worst that was seen.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from autograder import artefacts
+from autograder.execution import cache_folder, content_hash, replace_cached
+from autograder.paths import ROOT
+from autograder.spec import Artefact
+from course_lib import records
+
+BAR = 0.01
+DRAWS = 200_000
+TIMEOUT = 600.0  # seconds for the flights of one agent, on a machine busy with others
+
+
+@dataclass(frozen=True)
+class Group:
+    """Agents that were trained alike: their returns in the judge's episodes, (agents, episodes). `mistake` is empty if rightly."""
+
+    variant: str
+    mistake: str
+    returns: np.ndarray
+
+
+@dataclass(frozen=True)
+class Row:
+    """A group as the book prints it: the agents' mean returns (least, middle, most), how many earn all points and how many half of
+    them, and the chance that a further agent goes wrong: that a right one earns less than all, a wrong one half or more."""
+
+    variant: str
+    mistake: str
+    agents: int
+    least: float
+    middle: float
+    most: float
+    full: int
+    half: int
+    chance: float
+
+
+def groups(artefact: Artefact, runs: Path | None = None) -> list[Group]:
+    """Fly all agents of the artefact's experiment that were trained for this, on all cores, once for each state of their files.
+
+    Args:
+      artefact: its `experiment` has a variant `right`, and others with a `mistake` in their configurations.
+      runs: the folder of all experiments' records; found by itself if not given.
+
+    Raises: records.RecordsError if agents are missing.
+    """
+    known = records.load(artefact.experiment, runs)
+    mistakes = {variant: known.configuration(variant).get("mistake", "") for variant in known.variants}
+    wanted = {variant: mistake for variant, mistake in mistakes.items() if mistake or variant == artefact.right}
+    files = {variant: [known.artefact(variant, seed, "safetensors") for seed in known.seeds(variant)] for variant in wanted}
+    judged = artefacts.hidden(artefact)
+    inputs = [artefacts.PROGRAM, ROOT / "constraints.txt", *(path for paths in files.values() for path in paths)]
+    cached = cache_folder() / f"{artefact.name}-{content_hash([str(judged.seeds)], inputs)}.json"
+    if not cached.exists():
+        print(f"{artefact.name}: flying the agents of the experiment {artefact.experiment} (minutes, the first time)", flush=True)
+
+        def fly(path: Path) -> list[float]:
+            return artefacts.fly(judged, path.read_bytes(), TIMEOUT).tolist()
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:  # each waits for a process of its own
+            replace_cached(cached, json.dumps({variant: list(pool.map(fly, paths)) for variant, paths in files.items()}))
+    flown = json.loads(cached.read_text(encoding="utf-8"))
+    return [Group(variant, mistake, np.array(flown[variant])) for variant, mistake in wanted.items()]
+
+
+def rows(artefact: Artefact, found: Sequence[Group]) -> list[Row]:
+    """What the groups say about the artefact's thresholds."""
+    low, high = artefact.thresholds
+    half, result = (low + high) / 2, []
+    for group in found:
+        means = group.returns.mean(axis=1)
+        chance = chance_from(group.returns, half) if group.mistake else chance_below(group.returns, high)
+        spread = (float(means.min()), float(np.median(means)), float(means.max()))
+        counts = (int((means >= high).sum()), int((means >= half).sum()))
+        result.append(Row(group.variant, group.mistake, len(means), *spread, *counts, chance))
+    return result
+
+
+def chance_below(returns: np.ndarray, mark: float, seed: int = 0) -> float:
+    """The chance that the mean return of a further agent is below `mark`.
+
+    Args:
+      returns: of agents that were trained alike, in the same episodes; (agents, episodes), at least three agents.
+      mark: in units of return.
+      seed: of the random draws.
+
+    Returns: the larger of the two estimates that the module describes.
+    """
+    agents, episodes = returns.shape
+    if agents < 3:
+        raise ValueError(f"returns must be of at least 3 agents, got {agents}")
+    generator = np.random.default_rng(seed)
+    means = returns.mean(axis=1)
+    # the mean of many episodes drawn with replacement is normal, but for what no table of two digits shows
+    drawn = generator.integers(agents, size=DRAWS)
+    resampled = means[drawn] + returns.std(axis=1)[drawn] / math.sqrt(episodes) * generator.standard_normal(DRAWS)
+    further = means.mean() + means.std(ddof=1) * math.sqrt(1 + 1 / agents) * generator.standard_t(agents - 1, DRAWS)
+    return float(max((resampled < mark).mean(), (further < mark).mean()))
+
+
+def chance_from(returns: np.ndarray, mark: float, seed: int = 0) -> float:
+    """The chance that the mean return of a further agent is `mark` or more; as `chance_below`."""
+    return chance_below(-returns, -mark, seed)

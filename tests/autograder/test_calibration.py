@@ -1,0 +1,87 @@
+"""The statistics behind thresholds, and the bar that every artefact's must pass."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from autograder import artefacts, calibration, checks
+from autograder.spec import Artefact
+from course_lib import records
+from course_lib.flight import TASKS
+
+ARTEFACTS = [exercise for exercise in checks.all_exercises() if isinstance(exercise, Artefact)]
+
+
+def agents(centre, between, within, count=20, seed=0):
+    generator = np.random.default_rng(seed)
+    return generator.normal(centre, between, (count, 1)) + generator.normal(0, within, (count, 100))
+
+
+def test_the_chance_follows_what_differs_between_agents():
+    # normal agents, two deviations above the mark: a fortieth, and somewhat more as their deviation is estimated
+    chances = [calibration.chance_below(agents(220, 10, 1, seed=seed), 200) for seed in range(200)]
+    assert 0.02 < np.mean(chances) < 0.06
+
+
+def test_the_chance_follows_what_differs_between_episodes():
+    # agents that are all alike: what is left is the error of the mean of a hundred episodes
+    alike = np.tile(np.random.default_rng(0).normal(0, 1, (1, 100)), (20, 1))
+    alike = 220 + 100 * (alike - alike.mean()) / alike.std()
+    assert calibration.chance_below(alike, 200) == pytest.approx(0.0228, abs=0.002)
+
+
+def test_one_failure_among_twenty_is_seen():
+    returns = agents(280, 1, 1)
+    returns[0] -= 200
+    assert calibration.chance_below(returns, 200) >= 0.05
+
+
+def test_above_is_the_mirror_of_below():
+    returns = agents(0, 30, 30)
+    assert calibration.chance_from(returns, 40) == calibration.chance_below(-returns, -40)
+
+
+def test_two_agents_are_too_few():
+    with pytest.raises(ValueError, match="at least 3 agents, got 2"):
+        calibration.chance_below(agents(0, 1, 1, count=2), 0)
+
+
+def test_a_row_counts_full_and_half_points():
+    train = Artefact("train", lambda: None, "f", "lander", 4.0, (0.0, 200.0))
+    right, wrong = agents(260, 5, 50), agents(-100, 20, 50)
+    found = [calibration.Group("right", "", right), calibration.Group("masked", "ignores the mask", wrong)]
+    first, second = calibration.rows(train, found)
+    assert (first.agents, first.full, first.half) == (20, 20, 20) and first.chance < 0.01
+    assert (second.full, second.half) == (0, 0) and second.chance < 0.01
+    assert first.least <= first.middle <= first.most and first.middle == pytest.approx(260, abs=5)
+
+
+def test_the_agents_of_an_experiment_are_flown_once_as_the_judge_flies(tmp_path, monkeypatch):
+    policy = safetensors.numpy.save({name: np.full(shape, 0.01, np.float32) for name, shape in TASKS["lander"].tensors.items()})
+    for variant, configuration in (("ours", {}), ("broken_sign", {"mistake": "It descends."}), ("no_clip", {})):
+        for seed in range(2 if variant == "ours" else 1):
+            provenance = {"variant": variant, "seed": seed, "configuration": configuration}
+            records.write(tmp_path / "runs" / "lander" / f"{variant}-{seed}.parquet", [{"env_steps": 1}], provenance)
+            (tmp_path / "runs" / "lander" / f"{variant}-{seed}.safetensors").write_bytes(policy)
+    monkeypatch.setattr(calibration, "cache_folder", lambda: tmp_path)
+    train = Artefact("train", lambda: None, "f", "lander", 4.0, (0.0, 200.0), episodes=3, experiment="lander")
+    found = {group.variant: group for group in calibration.groups(train, tmp_path / "runs")}
+    assert {variant: (group.mistake, group.returns.shape) for variant, group in found.items()} == {
+        "broken_sign": ("It descends.", (1, 3)),
+        "ours": ("", (2, 3)),
+    }
+    judged, _ = artefacts.judge(replace(artefacts.hidden(train), file="ours-0.safetensors"), tmp_path / "runs" / "lander", 60)
+    assert f"Mean return {found['ours'].returns[0].mean():.1f} over 3 episodes" in judged.message
+    monkeypatch.setattr(artefacts, "fly", None)
+    again = {group.variant: group for group in calibration.groups(train, tmp_path / "runs")}
+    assert np.array_equal(again["ours"].returns, found["ours"].returns)
+
+
+@pytest.mark.parametrize("artefact", ARTEFACTS, ids=lambda artefact: artefact.name)
+def test_a_right_agent_earns_all_points_and_a_wrong_one_not_half_of_them(artefact):
+    rows = calibration.rows(artefact, calibration.groups(artefact))
+    assert sum(row.agents for row in rows if not row.mistake) >= 20 and sum(row.agents for row in rows if row.mistake) >= 20
+    assert [row for row in rows if not row.mistake and (row.full < row.agents or row.chance > calibration.BAR)] == []
+    assert [row for row in rows if row.mistake and (row.half or row.chance > calibration.BAR)] == []
