@@ -15,16 +15,16 @@ def collect_demonstrations(policy, env, num_episodes, seed):
     """Let an expert act for some episodes, and write down what it saw and what it did.
 
     Args:
-      policy: the expert: obs (B, O) float32 tensor -> actions (B, A), or (B,) int64 for discrete
-        ones. Called with B = 1.
+      policy: the expert: obs (B, O) float32 tensor -> actions (B, A), or (B,) int64 for
+        discrete ones. Called with B = 1.
       env: a Gymnasium environment (not a vector environment).
-      num_episodes: E ≥ 1. Episode k begins with env.reset(seed=seed + k) and lasts until it is
-        terminated or truncated.
+      num_episodes: E ≥ 1. Episode k begins with env.reset(seed=seed + k) and lasts until
+        it is terminated or truncated.
       seed: of the first episode.
 
-    Returns: Demonstrations of M steps without a graph: obs (M, O) float32, before each action;
-      actions (M, A) float32 or (M,) int64, as the policy returned them; episode_ids (M,) int64
-      from 0; returns (E,) float32, undiscounted.
+    Returns: Demonstrations of M steps without a graph: obs (M, O) float32, before each
+      action; actions (M, A) float32 or (M,) int64, as the policy returned them;
+      episode_ids (M,) int64 from 0; returns (E,) float32, undiscounted.
     Raises: ValueError if num_episodes < 1.
     """
     validate.at_least_one(num_episodes=num_episodes)
@@ -47,16 +47,18 @@ def collect_demonstrations(policy, env, num_episodes, seed):
 
 
 def split_by_episode(episode_ids, fraction, generator):
-    """Divide the steps of a data set into training and held-out steps, whole episodes at a time.
+    """Divide the steps of a data set into training and held-out ones, by whole episodes.
 
     Args:
-      episode_ids: which episode each step belongs to; (M,) int64, any numbers, in any order.
-      fraction: share of the episodes to hold out, in [0, 1]. Their number is rounded, and at least
-        one episode stays on either side.
+      episode_ids: which episode each step belongs to; (M,) int64, any numbers, in any
+        order.
+      fraction: share of the episodes to hold out, in [0, 1]. Their number is rounded, and
+        at least one episode stays on either side.
       generator: torch.Generator, the only source of randomness.
 
     Returns: (train, held_out), two complementary (M,) bool masks.
-    Raises: ValueError if fraction lies outside [0, 1], or episode_ids has fewer than two episodes.
+    Raises: ValueError if fraction lies outside [0, 1], or episode_ids has fewer than two
+      episodes.
     """
     validate.unit_interval(fraction=fraction)
     episodes = episode_ids.unique()
@@ -69,12 +71,12 @@ def split_by_episode(episode_ids, fraction, generator):
 
 
 def behavioural_cloning_loss(logits, expert_actions):
-    """How surprised a policy with discrete actions is by what the expert did: the mean cross-entropy.
+    """How surprised a policy with discrete actions is by what the expert did.
 
         L = -mean(log π(a*|s)),   π(a|s) = exp(logits_a) / Σ_b exp(logits_b)
 
-    The negative log-likelihood of the expert's actions; Goodfellow et al. (2016), section 5.5,
-    https://www.deeplearningbook.org
+    The mean negative log-likelihood of the expert's actions; Goodfellow et al. (2016),
+    section 5.5, https://www.deeplearningbook.org
 
     Args:
       logits: unnormalised log-probabilities of all actions; (B, A). Receives gradient.
@@ -95,8 +97,8 @@ def gaussian_cloning_loss(mean, log_std, expert_actions):
 
         L = mean over B of Σ_i (½ ((a*_i - μ_i) / σ_i)² + log σ_i + ½ log 2π)
 
-    The negative log-likelihood of the expert's actions; Goodfellow et al. (2016), section 5.5,
-    https://www.deeplearningbook.org
+    The mean negative log-likelihood of the expert's actions; Goodfellow et al. (2016),
+    section 5.5, https://www.deeplearningbook.org
 
     Args:
       mean: μ, the policy's mean actions; (B, A). Receives gradient.
@@ -104,7 +106,8 @@ def gaussian_cloning_loss(mean, log_std, expert_actions):
       expert_actions: a*, what the expert did; (B, A). No gradient.
 
     Returns: scalar (0-dim) tensor, in nats.
-    Raises: ValueError if mean and expert_actions differ in shape, or log_std fits neither way.
+    Raises: ValueError if mean and expert_actions differ in shape, or log_std is neither
+      (A,) nor (B, A).
     """
     validate.same_shape(mean=mean, expert_actions=expert_actions)
     if log_std.shape not in (mean.shape, mean.shape[-1:]):
@@ -113,22 +116,25 @@ def gaussian_cloning_loss(mean, log_std, expert_actions):
     return surprise.sum(-1).mean()
 
 
-def train_bc(network, loss_fn, obs, actions, num_steps=1000, batch_size=128, learning_rate=3e-3, generator=None):
-    """Behavioural cloning: fit a network to the expert's actions, by gradient descent on minibatches.
+def train_bc(
+    network, loss_fn, obs, actions, num_steps=1000, batch_size=128, learning_rate=3e-3, generator=None
+):  # fmt: skip
+    """Behavioural cloning: fit a network to the expert's actions, by gradient descent.
 
     Pomerleau (1991), https://doi.org/10.1162/neco.1991.3.1.88
 
     Args:
-      network: torch.nn.Module, trained in place; its output for obs (B, O) is what loss_fn takes.
+      network: torch.nn.Module, trained in place; loss_fn takes its output for obs (B, O).
       loss_fn: (network's output, actions of the batch) -> scalar tensor.
       obs, actions: of the demonstrations; M rows each.
       num_steps: gradient steps.
-      batch_size: rows of a minibatch, drawn at random (all rows if there are no more than that).
+      batch_size: rows of a minibatch, drawn at random (all rows if there are no more).
       learning_rate: the optimiser's step size; Adam is a good choice.
       generator: torch.Generator for the minibatches, or None for PyTorch's own.
 
     Returns: (num_steps,) tensor without a graph: each minibatch's loss before its step.
-    Raises: ValueError if obs and actions differ in their number of rows, or num_steps < 1.
+    Raises: ValueError if obs and actions differ in their number of rows, or
+      num_steps < 1.
     """
     validate.at_least_one(num_steps=num_steps)
     validate.same_length(obs=obs, actions=actions)
@@ -148,12 +154,12 @@ def evaluate(policy, env, num_episodes, seed):
     """Let a policy act for some episodes, and report the return of each.
 
     Args:
-      policy: obs (B, O) float32 tensor -> actions (B, A), or (B,) int64 for discrete ones. Called
-        with B = 1.
+      policy: obs (B, O) float32 tensor -> actions (B, A), or (B,) int64 for discrete ones.
+        Called with B = 1.
       env: a Gymnasium environment (not a vector environment).
-      num_episodes: E ≥ 1. Episode k begins with env.reset(seed=seed + k) and lasts until it is
-        terminated or truncated.
-      seed: of the first episode; policies that are evaluated with the same seed meet the same starts.
+      num_episodes: E ≥ 1. Episode k begins with env.reset(seed=seed + k) and lasts until
+        it is terminated or truncated.
+      seed: of the first episode; policies evaluated with one seed meet the same starts.
 
     Returns: (E,) float32 undiscounted returns, without a graph.
     Raises: ValueError if num_episodes < 1.
@@ -166,14 +172,15 @@ def state_shift(expert_obs, agent_obs):
 
         2 E|X - Y| - E|X - X'| - E|Y - Y'|,   X = expert_obs / σ,   Y = agent_obs / σ
 
-    The squared energy distance, with means over all ordered pairs (i = j included) and σ the expert's
-    standard deviation in each dimension. Székely and Rizzo (2013), https://doi.org/10.1016/j.jspi.2013.03.018
+    The squared energy distance, with means over all ordered pairs (i = j included) and σ
+    the expert's standard deviation in each dimension. Székely and Rizzo (2013),
+    https://doi.org/10.1016/j.jspi.2013.03.018
 
     Args:
       expert_obs: (N, O); no dimension is constant.
       agent_obs: (M, O).
 
-    Returns: scalar (0-dim) tensor, at least 0 (up to rounding) and 0 for equal samples.
+    Returns: scalar (0-dim) tensor, at least 0 (up to rounding); 0 for equal samples.
     Raises: ValueError if the two are not matrices of one width.
     """
     if expert_obs.ndim != 2 or agent_obs.ndim != 2 or expert_obs.shape[1] != agent_obs.shape[1]:
@@ -199,8 +206,8 @@ def repaired_pairs(obs, actions, episode_ids):
       actions: as logged; (M, A).
       episode_ids: (M,) int64; the steps of an episode stand together and in order of time.
 
-    Returns: (obs, actions), (K, O) and (K, A): row by row what the driver saw and what it did then,
-      for all steps of which the log holds both, in their order.
+    Returns: (obs, actions), (K, O) and (K, A): row by row what the driver saw and what it
+      did then, for all steps of which the log holds both, in their order.
     Raises: ValueError if the three differ in their number of rows.
     """
     validate.same_length(obs=obs, actions=actions, episode_ids=episode_ids)
