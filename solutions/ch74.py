@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import torch
-from torch.nn import functional as F
 
 from course_lib import validate
 from course_lib.demonstrations import Demonstrations
@@ -89,7 +88,7 @@ def behavioural_cloning_loss(logits, expert_actions):
         raise ValueError(
             f"logits must be (B, A) and expert_actions (B,), got {tuple(logits.shape)} and {tuple(expert_actions.shape)}"
         )
-    return F.cross_entropy(logits, expert_actions)
+    return torch.nn.functional.cross_entropy(logits, expert_actions)
 
 
 def gaussian_cloning_loss(mean, log_std, expert_actions):
