@@ -51,7 +51,7 @@ def training_curve(_arguments: dict[str, Any], outputs: dict[str, np.ndarray]) -
         raise ValueError("the losses must be a tensor of numbers, one for each step")
     return {
         "number of losses": np.array(len(losses)),
-        "first loss": losses[0].astype(np.float32),
+        "first loss": np.array(losses[0], dtype=np.float32),
         "the loss falls": np.array(bool(losses[-1] < 0.99 * losses[0])),
         "it falls by a quarter": np.array(bool(losses[-1] < 0.75 * losses[0])),
     }

@@ -45,6 +45,7 @@ def test_training_curve():
     assert (
         curve["number of losses"] == 2 and curve["first loss"] == 2 and curve["the loss falls"] and curve["it falls by a quarter"]
     )
+    assert all(isinstance(value, np.ndarray) for value in curve.values())
     assert not views.training_curve({}, {"": np.array([1.0, 1.0 - 1e-7])})["the loss falls"]
     for unreadable in ({}, {"": np.array(1.0)}, {"": np.array([1, 2])}):
         with pytest.raises(ValueError, match="losses"):
