@@ -218,15 +218,16 @@ class Records:
     def cost(self, *variants: str) -> str:
         """How long the runs of these variants (of all, by default) took, and on what: part of a sentence.
 
-        Such as "30 runs of 4 to 6 minutes, 2.5 hours in all, one core each of a machine with 2 cores (AMD EPYC) and 24 GB of memory".
+        Such as "20 runs of 2 to 4 minutes each, 1.1 hours in all by the clock and 16 minutes of processor time, on a machine with 2
+        cores (AMD EPYC) and 24 GB of memory": the clock of a machine that did other work beside them runs fast.
         """
         runs = [run for run in self.runs if not variants or run.variant in variants]
-        times = np.array([run.provenance["wall_seconds"] for run in runs])
-        shortest, longest = duration(times.min()), duration(times.max())
+        wall, cpu = (np.array([run.provenance[f"{kind}_seconds"] for run in runs]) for kind in ("wall", "cpu"))
+        shortest, longest = duration(wall.min()), duration(wall.max())
         each = longest if shortest == longest else f"{shortest} to {longest}"
         machines = dict.fromkeys(machine(run.provenance["machine"]) for run in runs)
-        count = f"{len(runs)} runs of {each} each" if len(runs) > 1 else f"one run of {each}"
-        return f"{count}, {duration(times.sum())} of computing in all, on {' and '.join(machines)}"
+        what = f"{len(runs)} runs of {each} each, {duration(wall.sum())} in all" if len(runs) > 1 else f"one run of {each}"
+        return f"{what} by the clock and {duration(cpu.sum())} of processor time, on {' and '.join(machines)}"
 
     def _again(self, variant: str) -> str:
         return f"`{self.command(variant)}` makes it again, once its record is deleted"
@@ -242,8 +243,7 @@ def duration(seconds: float) -> str:
     """A time in words: 35 seconds, 4 minutes, 2.5 hours."""
     for size, name in ((3600, "hour"), (60, "minute")):
         if seconds >= 1.5 * size:
-            amount = seconds / size
-            return f"{amount:.1f} {name}s" if amount < 10 else f"{amount:.0f} {name}s"
+            return f"{seconds / size:.2g} {name}s" if seconds < 10 * size else f"{seconds / size:.0f} {name}s"
     return f"{seconds:.0f} seconds"
 
 

@@ -185,7 +185,7 @@ def make_one(task: Task, progress: Progress) -> Outcome:
 
 def _make(task: Task, progress: Progress) -> None:
     module = _module(Path(task.file))
-    clock = _Clock(task.checkpoints)
+    clock, code = _Clock(task.checkpoints), commit()
 
     def report(done: int, total: int) -> None:
         clock.tick()
@@ -204,7 +204,7 @@ def _make(task: Task, progress: Progress) -> None:
         "configuration": module.VARIANTS[task.variant],
         "summary": result.summary,
         "versions": versions(),
-        "commit": commit(),
+        "commit": code,
         "command": task.command,
         "wall_seconds": round(wall, 1),
         "cpu_seconds": round(cpu, 1),

@@ -14,7 +14,7 @@ MACHINE = {"cores": 2, "memory_gb": 24, "cpu": "AMD EPYC"}
 def provenance(variant="a", seed=0, **others):
     return {
         "experiment": "toy", "variant": variant, "seed": seed, "configuration": {"lr": 0.1}, "summary": {}, "wall_seconds": 300.0,
-        "machine": MACHINE, **others,
+        "cpu_seconds": 60.0,         "machine": MACHINE, **others,
     }  # fmt: skip
 
 
@@ -93,8 +93,10 @@ def test_the_cost_is_a_part_of_a_sentence(tmp_path):
     put(tmp_path, "b", 0, line(1, [1]), wall_seconds=7200.0)
     on = "on a machine with 2 cores (AMD EPYC) and 24 GB of memory"
     loaded = records.load("toy", tmp_path)
-    assert loaded.cost() == f"2 runs of 4.0 minutes to 2.0 hours each, 2.1 hours of computing in all, {on}"
-    assert loaded.cost("a") == f"one run of 4.0 minutes, 4.0 minutes of computing in all, {on}"
+    assert loaded.cost() == (
+        f"2 runs of 4 minutes to 2 hours each, 2.1 hours in all by the clock and 2 minutes of processor time, {on}"
+    )
+    assert loaded.cost("a") == f"one run of 4 minutes by the clock and 60 seconds of processor time, {on}"
 
 
 def test_missing_records_name_the_command_that_makes_them(tmp_path):

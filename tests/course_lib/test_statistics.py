@@ -48,6 +48,6 @@ def test_tables_are_aligned():
     assert interval(np.full(5, 2.5), 1) == "2.5 [2.5, 2.5]"
     assert table(rows, {"KL": 2}).splitlines() == [
         "                 return                 KL",
-        "ours      250 [250, 250]  0.01 [0.01, 0.01]",
-        "no clip      30 [30, 30]               none",
+        "ours     250 [250, 250]  0.01 [0.01, 0.01]",
+        "no clip     30 [30, 30]               none",
     ]
