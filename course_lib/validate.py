@@ -29,6 +29,30 @@ def unit_interval(**scalars: float) -> None:
             raise ValueError(f"{name} must lie in [0, 1], got {value}")
 
 
+def at_least_one(**counts: int) -> None:
+    """Raise ValueError unless every count is at least 1.
+
+    >>> at_least_one(num_episodes=0)
+    Traceback (most recent call last):
+    ValueError: num_episodes must be at least 1, got 0
+    """
+    for name, value in counts.items():
+        if value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
+
+
+def same_length(**tensors: torch.Tensor) -> None:
+    """Raise ValueError unless all tensors have as many rows as each other.
+
+    >>> same_length(obs=torch.zeros(3, 2), actions=torch.zeros(4))
+    Traceback (most recent call last):
+    ValueError: obs, actions must have as many rows as each other, got obs 3, actions 4
+    """
+    if len({len(tensor) for tensor in tensors.values()}) > 1:
+        lengths = ", ".join(f"{name} {len(tensor)}" for name, tensor in tensors.items())
+        raise ValueError(f"{', '.join(tensors)} must have as many rows as each other, got {lengths}")
+
+
 def non_negative(**scalars: float) -> None:
     """Raise ValueError unless every scalar is at least 0; infinity is.
 
