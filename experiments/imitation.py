@@ -58,7 +58,7 @@ def fit(obs: torch.Tensor, actions: torch.Tensor, settings: dict, seed: int) -> 
     generator = seed_everything(seed)
     clone = Clone(obs, actions.shape[1], settings["hidden"])
     losses = train_bc(
-        clone, lambda outputs, taken: gaussian_cloning_loss(*outputs, taken), obs, actions,
+        clone, lambda outputs, taken: gaussian_cloning_loss(outputs[0], outputs[1], taken), obs, actions,
         settings["num_steps"], settings["batch_size"], settings["learning_rate"], generator,
     )  # fmt: skip
     return clone, losses

@@ -193,10 +193,10 @@ def _from_whole_episodes(policy, env, num_episodes, seed):
                 break
             obs.append(after)
         episodes.append((np.stack(obs), torch.stack(actions), np.full(len(obs), k), sum(rewards)))
-    obs, actions, ids, returns = zip(*episodes, strict=True)
+    seen, taken, ids, returns = zip(*episodes, strict=True)
     return Demonstrations(
-        obs=torch.from_numpy(np.concatenate(obs)),
-        actions=torch.cat(actions).clone(),
+        obs=torch.from_numpy(np.concatenate(seen)),
+        actions=torch.cat(taken).clone(),
         episode_ids=torch.from_numpy(np.concatenate(ids)),
         returns=torch.tensor(returns, dtype=torch.float32),
     )
@@ -533,12 +533,20 @@ SPLIT_BY_EPISODE = Exercise(
         ),
         Misconception(
             "rounded-to-none",
-            _splits(lambda *given: _sides(_held(*given, count=lambda number, fraction: int(fraction * number)))),
+            _splits(
+                lambda ids, fraction, generator: _sides(
+                    _held(ids, fraction, generator, count=lambda number, fraction: int(fraction * number))
+                )
+            ),
             "With few episodes the count rounds down to 0, and nothing is held out: at least one episode stays on either side.",
         ),
         Misconception(
             "rounded-to-all",
-            _splits(lambda *given: _sides(_held(*given, count=lambda number, fraction: max(math.ceil(fraction * number), 1)))),
+            _splits(
+                lambda ids, fraction, generator: _sides(
+                    _held(ids, fraction, generator, count=lambda number, fraction: max(math.ceil(fraction * number), 1))
+                )
+            ),
             "With few episodes the count rounds up to all, and nothing is left to train on: at least one episode stays on either side.",
         ),
         Misconception(
@@ -548,12 +556,20 @@ SPLIT_BY_EPISODE = Exercise(
         ),
         Misconception(
             "not-shuffled",
-            _splits(lambda *given: _sides(_held(*given, order=lambda number, _generator: torch.arange(number)))),
+            _splits(
+                lambda ids, fraction, generator: _sides(
+                    _held(ids, fraction, generator, order=lambda number, _generator: torch.arange(number))
+                )
+            ),
             "It is always the same episodes that are held out, the first ones: draw their order from the generator.",
         ),
         Misconception(
             "global-generator",
-            _splits(lambda *given: _sides(_held(*given, order=lambda number, _generator: torch.randperm(number)))),
+            _splits(
+                lambda ids, fraction, generator: _sides(
+                    _held(ids, fraction, generator, order=lambda number, _generator: torch.randperm(number))
+                )
+            ),
             "The order comes from the global generator: pass generator=generator, so that a seed makes the split again.",
         ),
         Misconception(
@@ -1046,21 +1062,24 @@ def _least_squares(network, loss_fn, obs, actions, **_settings):
     network.bias.data.copy_(solution[2])
 
 
-_NETWORK = {"returns": ("network",), "atol": 0.6}
+_NETWORK = ("network",)  # what is looked at after the call
 
 TRAIN_BC = Exercise(
     name="train_bc",
     reference=ch74.train_bc,
     criteria={"values": 0.8, "gradient": 0.05, "inputs": 0.05, "errors": 0.1},
     cases=(
-        Case("a linear network on linear data", _regression(), closed_form=_least_squares, visible=True, **_NETWORK),
+        Case(
+            "a linear network on linear data", _regression(), closed_form=_least_squares, visible=True, returns=_NETWORK, atol=0.6
+        ),
         Case(
             "a row at a time, no noise",
             _regression(batch_size=1, num_steps=48, noise=0.0),
             closed_form=_least_squares,
-            **_NETWORK | {"atol": 1.0},
+            returns=_NETWORK,
+            atol=1.0,
         ),
-        Case("a loss of twice the output", _regression(gain=2.0, num_steps=16), **_NETWORK),
+        Case("a loss of twice the output", _regression(gain=2.0, num_steps=16), returns=_NETWORK, atol=0.6),
         Case("the losses on the way", _lines, view="training_curve", dtype=torch.float32, visible=True),
         Case(
             "the generator is drawn from",
