@@ -163,7 +163,7 @@ def _agents(row: dict) -> list[str]:
     low, high = row["thresholds"]
     table = [
         f"| {_plain(group['mistake']) or 'trained rightly'} | {_must_fail(group, row)} | {group['agents']} |"
-        f" {group['least']:.0f} | {group['middle']:.0f} | {group['most']:.0f} | {group['full']} | {group['half']} |"
+        f" {group['least']:.0f} | {group['middle']:.0f} | {group['most']:.0f} | {group['full']} | {group['half']} | {group['chance']:.1%} |"
         for group in row["agents"]
     ]
     return [
@@ -171,10 +171,11 @@ def _agents(row: dict) -> list[str]:
         "",
         f"Points grow from none at a mean return of {low:g} to all at {high:g}. Mean returns of {row['episodes']} recorded episodes, of"
         " agents that differ in the seed of their training. Some mistakes let an agent land all the same: what a file does in flight"
-        " cannot show them, and the checks of the functions do.",
+        " cannot show them, and the checks of the functions do. The last column estimates the chance that a further agent goes wrong: that"
+        " a right one earns less than all points, and that one with a mistake earns half or more.",
         "",
-        "| Agents | A flight must show it | Number | Least | Middle | Most | With all points | With half of them or more |",
-        "|---|---|---|---|---|---|---|---|",
+        "| Agents | A flight must show it | Number | Least | Middle | Most | With all points | With half of them or more | Chance |",
+        "|---|---|---|---|---|---|---|---|---|",
         *table,
         "",
     ]

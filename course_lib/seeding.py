@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from dataclasses import InitVar, dataclass, field
 
 import numpy as np
 import torch
@@ -23,23 +22,3 @@ def seed_everything(seed: int) -> torch.Generator:
 def generator(seed: int) -> torch.Generator:
     """A torch generator of its own, for explicit draws."""
     return torch.Generator().manual_seed(seed)
-
-
-@dataclass(eq=False)
-class WatchedGenerator(torch.Generator):
-    """A torch generator that knows whether anything has been drawn from it: `drawn`."""
-
-    seed: InitVar[int]
-    drawn: bool = field(init=False)
-
-    def __new__(cls, seed):
-        return super().__new__(cls)
-
-    def __post_init__(self, seed):
-        self.manual_seed(seed)
-        self.first_state = self.get_state()
-
-    def __getattr__(self, name):
-        if name != "drawn":
-            raise AttributeError(name)
-        return not torch.equal(self.get_state(), self.first_state)

@@ -1414,7 +1414,7 @@ PPO_UPDATE = Exercise(
     cases=(
         _case(
             "the policy after two epochs",
-            _updated(clip_range=0.05, vf_coef=0.1, ent_coef=0.2, max_grad_norm=0.1),
+            _updated(clip_range=0.01, vf_coef=0.1, ent_coef=0.2, max_grad_norm=0.1),
             returns=_AFTERWARDS,
             visible=True,
         ),

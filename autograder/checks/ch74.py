@@ -333,14 +333,14 @@ def _steps(lengths, ids=None):
     return numbers.repeat_interleave(torch.as_tensor(lengths))
 
 
-def _split(episode_ids, fraction, maker="seeding.generator"):
+def _split(episode_ids, fraction):
     """`episode_ids` is made from the case's generator."""
 
     def inputs(generator):
         return {
             "episode_ids": episode_ids(generator),
             "fraction": fraction,
-            "generator": built(maker, seed=_integer(generator, 10_000)),
+            "generator": built("seeding.generator", seed=_integer(generator, 10_000)),
         }
 
     return inputs
@@ -492,8 +492,9 @@ SPLIT_BY_EPISODE = Exercise(
         Case("two splits in a row", _split(_even(60, 2), 0.5), repeat=2, view="two_splits", visible=True),
         Case(
             "the generator is drawn from",
-            _split(_even(20), 0.3, "seeding.WatchedGenerator"),
+            _split(_even(20), 0.3),
             returns=("generator",),
+            view="drawn_from",
             visible=True,
         ),
         Case("fraction = -0.1", _split(_even(5), -0.1), raises=["fraction"]),
@@ -937,7 +938,7 @@ GAUSSIAN_CLONING_LOSS = Exercise(
 # --------------------------------------------------------------------------------------------------------------- train_bc
 
 
-def _regression(gain=1.0, rows=48, batch_size=48, num_steps=17, maker="seeding.generator", noise=0.3):
+def _regression(gain=1.0, rows=48, batch_size=48, num_steps=17, noise=0.3):
     """Linear data for a linear network that begins at 0, and squared errors of `gain` times its output."""
 
     def inputs(generator):
@@ -954,7 +955,7 @@ def _regression(gain=1.0, rows=48, batch_size=48, num_steps=17, maker="seeding.g
             "num_steps": num_steps,
             "batch_size": batch_size,
             "learning_rate": 0.15,
-            "generator": built(maker, seed=_integer(generator, 10_000)),
+            "generator": built("seeding.generator", seed=_integer(generator, 10_000)),
         }
 
     return inputs
@@ -1083,8 +1084,9 @@ TRAIN_BC = Exercise(
         Case("the losses on the way", _lines, view="training_curve", dtype=torch.float32, visible=True),
         Case(
             "the generator is drawn from",
-            _regression(batch_size=5, num_steps=2, maker="seeding.WatchedGenerator"),
+            _regression(batch_size=5, num_steps=2),
             returns=("generator",),
+            view="drawn_from",
             visible=True,
         ),
         Case("num_steps = 0", _regression(num_steps=0), raises=["num_steps"]),

@@ -157,8 +157,8 @@ def test_kill_matrix_shows_the_agents_behind_the_thresholds_of_a_file():
     flown = {"exercise": "train", "thresholds": (0.0, 200.0), "episodes": 100, "agents": agents, "wrong": ["x"]}
     page = book.kill_matrix_page({"99. Tiny": [flown]})
     assert "Points grow from none at a mean return of 0 to all at 200." in page and "100 recorded episodes" in page
-    assert "| trained rightly |  | 20 | 201 | 250 | 272 | 20 | 20 |" in page
-    assert r"| It descends \| the hill. | yes | 20 | 201 | 250 | 272 | 0 | 1 |" in page
+    assert "| trained rightly |  | 20 | 201 | 250 | 272 | 20 | 20 | 0.4% |" in page
+    assert r"| It descends \| the hill. | yes | 20 | 201 | 250 | 272 | 0 | 1 | 0.4% |" in page
 
 
 def test_kill_matrix_is_keyed_on_all_modules_that_decide_it():

@@ -68,15 +68,6 @@ def test_an_inverted_ratio_turns_the_gradient_around():
     np.testing.assert_array_equal(inverted, -before)
 
 
-def test_a_recomputed_ratio_is_always_one():
-    with ExitStack() as patches:
-        for patch in lander.MISTAKES["broken_old_log_probs_recomputed"]():
-            patches.enter_context(patch)
-        old_log_probs, advantages, values, returns = torch.zeros(4, 3)
-        _, metrics = ch45.ppo_loss(torch.ones(3), old_log_probs, advantages, values, returns, torch.zeros(()), 0.2, 0.5, 0.0)
-        assert ch45.fast_ppo_update is ch45.ppo_update and metrics["approx_kl"] == 0 and metrics["clip_fraction"] == 0
-
-
 def test_variants_change_one_setting_each():
     for variant, configuration in lander.VARIANTS.items():
         base = lander.VARIANTS["ours" if variant.startswith(("ours", "broken")) else "ours_200k"]

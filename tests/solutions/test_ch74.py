@@ -5,10 +5,8 @@ import math
 import pytest
 import torch
 
-from course_lib.cases import built
 from course_lib.demonstrations import Clone, SquaredError
 from course_lib.road import LinearPolicy, RoadDriver, RoadEnv
-from course_lib.runner import observe
 from solutions.ch74 import (
     behavioural_cloning_loss,
     collect_demonstrations,
@@ -212,9 +210,3 @@ def test_repaired_pairs_by_hand():
 def test_errors_name_the_argument_and_the_value_received(call, names):
     with pytest.raises(ValueError, match=names):
         call()
-
-
-def test_a_watched_generator_knows_whether_it_was_drawn_from():
-    watched = {"generator": built("seeding.WatchedGenerator", seed=3)}
-    for draw, drawn in ((lambda generator: torch.rand(1, generator=generator), True), (lambda generator: torch.rand(1), False)):
-        assert observe(draw, watched, returns=["generator"]).outputs["drawn"] == drawn
