@@ -17,16 +17,15 @@ def summarise(scores, confidence=0.95, num_resamples=1000, seed=0):
     """Interquartile mean over seeds, with a percentile bootstrap interval.
 
     Args:
-      scores: (seeds, ...), one row for each seed; summarised separately at every other position. Or a list of such arrays, one
-        for each task: the mean is over all of them together, and seeds are resampled within each (a stratified bootstrap).
+      scores: (seeds, ...), one row for each seed; summarised separately at every other position. Or a tuple of such arrays,
+        one for each task: the mean is over all of them together, and seeds are resampled within each (a stratified bootstrap).
       confidence: mass of the interval, in (0, 1).
       num_resamples: bootstrap samples of the seeds.
       seed: of the resampling, so that a figure is the same whenever it is drawn.
 
     Returns: (centre, low, high), each of shape (...).
     """
-    tasks = [np.asarray(task, dtype=float) for task in (scores if isinstance(scores, list | tuple) else [scores])]
-    tasks = tasks if tasks[0].ndim else [np.array(tasks)]  # a list of numbers is one task
+    tasks = [np.asarray(task, dtype=float) for task in (scores if isinstance(scores, tuple) else [scores])]
     generator = np.random.default_rng(seed)
     picks = [task[generator.integers(len(task), size=(len(task), num_resamples))] for task in tasks]
     resampled = middle_mean(np.concatenate(picks))

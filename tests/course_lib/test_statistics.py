@@ -37,7 +37,7 @@ def test_a_list_of_numbers_is_one_task():
 
 def test_tasks_are_resampled_apart():
     # each task's seeds agree: resampled within the tasks nothing varies, resampled over all of them it would
-    centre, low, high = summarise([np.full(4, 0.0), np.full(4, 8.0)])
+    centre, low, high = summarise((np.full(4, 0.0), np.full(4, 8.0)))
     assert (centre, low, high) == pytest.approx((4, 4, 4))
     _, low, high = summarise(np.array([0.0] * 4 + [8.0] * 4))
     assert low < 4 < high
