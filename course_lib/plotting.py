@@ -9,8 +9,15 @@ from IPython import get_ipython
 from course_lib.statistics import summarise
 
 GREY = "#686d72"
-COLOURS = ("#2a7fbf", "#d55e00", "#009e73", "#b5609a", "#8a7a1f")  # after Okabe and Ito, darkened or lightened to mid-contrast
-DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)))  # so that no curve is told from another by colour alone
+COLOURS = (
+    "#2a7fbf",
+    "#d55e00",
+    "#009e73",
+    "#b5609a",
+    "#8a7a1f",
+    "#7a6fd0",
+)  # after Okabe and Ito, darkened or lightened to mid-contrast
+DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (2, 1)))  # so that no curve is told from another by colour alone
 
 
 def use_style():
