@@ -170,11 +170,12 @@ def _agents(row: dict) -> list[str]:
         f"### `{row['exercise']}`",
         "",
         f"Points grow from none at a mean return of {low:g} to all at {high:g}. Mean returns of {row['episodes']} recorded episodes, of"
-        " agents that differ in the seed of their training. Some mistakes let an agent land all the same: what a file does in flight"
-        " cannot show them, and the checks of the functions do. The last column estimates the chance that a further agent goes wrong: that"
-        " a right one earns less than all points, and that one with a mistake earns half or more.",
+        " agents that differ in the seed of their training; how many earn all points, and how many half or more. Some mistakes let an"
+        " agent land all the same: what a file does in flight cannot show them, and the checks of the functions do. The last column"
+        " estimates the chance that a further agent goes wrong: that a right one earns less than all points, and that one with a"
+        " mistake earns half or more.",
         "",
-        "| Agents | A flight must show it | Number | Least | Middle | Most | With all points | With half of them or more | Chance |",
+        "| Agents | Must fail | Runs | Least | Middle | Most | All | Half | Chance |",
         "|---|---|---|---|---|---|---|---|---|",
         *table,
         "",

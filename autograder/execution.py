@@ -59,7 +59,7 @@ def code_inputs(chapter: Chapter) -> list[Path]:
     ]
     checks = [ROOT / "autograder" / name for name in ("spec.py", "freeze.py", f"checks/{chapter.assignment}.py")]
     recorded = [path for name in chapter.experiments for path in (RUNS / name).glob("[!.]*")]
-    answers = [path for path in (ROOT / "solutions").iterdir() if path.suffix in (".py", ".safetensors")]
+    answers = [path for suffix in ("py", "safetensors") for path in (ROOT / "solutions").glob(f"*.{suffix}")]
     return [*library, *recorded, *answers, *checks, ROOT / "requirements.txt", ROOT / "constraints.txt"]
 
 

@@ -121,7 +121,7 @@ def test_repaired_returns_do_not_depend_on_the_padding():
     [
         (lambda: segment_returns(REWARDS, MASK[:1]), r"mask \(1, 4\)"),
         (lambda: preference_probability(REWARDS[0], REWARDS[0][:, None]), r"returns_b \(4, 1\)"),
-        (lambda: simulate_preferences(row(1), row(0), 0, torch.Generator()), "temperature must be greater than 0, got 0"),
+        (lambda: simulate_preferences(row(1), row(0), 0, torch.Generator()), "temperature must be above 0, got 0"),
         (lambda: simulate_preferences(row(1), row(0, 1), 1, torch.Generator()), r"true_returns_b \(2,\)"),
         (lambda: bradley_terry_loss(row(1, 2), row(1)), r"rejected_returns \(1,\)"),
         (lambda: preference_accuracy(row(1, 2), row(1)), r"rejected_returns \(1,\)"),
