@@ -118,7 +118,8 @@ def _explorers(chapter):
 
     code = [cell for cell in chapter.cells if cell.kind == "code"]
     last = max(at for at, cell in enumerate(code) if "explore(" in cell.source)
-    with patch("course_lib.interactive.explore", explore), patch("matplotlib.pyplot.show"):
+    silent = patch("matplotlib.pyplot.show"), patch("IPython.display.display")
+    with patch("course_lib.interactive.explore", explore), silent[0], silent[1]:
         for cell in code[: last + 1]:
             source = f"from solutions.{chapter.assignment} import {cell.exercise}" if cell.exercise else cell.source
             exec(source, namespace)
