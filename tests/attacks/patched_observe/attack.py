@@ -11,9 +11,9 @@ SOURCE = """
 import sys
 from course_lib.cases import Observation
 from course_lib.runner import observe as honest
-def observe(function, arguments, differentiate=()):
+def observe(function, arguments, **others):
     if function.__name__ != "repaired_targets":
-        return honest(function, arguments, differentiate)
+        return honest(function, arguments, **others)
     shape = arguments["rewards"].shape
     import numpy
     return Observation(kind="tuple of 2", outputs={"0": numpy.ones(shape), "1": numpy.ones(shape)})
