@@ -28,9 +28,12 @@ LEARNER_PACKAGES = (
     "matplotlib",
     "ipywidgets",
     "gymnasium[box2d,mujoco]",
+    "pyarrow",
     "safetensors",
     "threadpoolctl",
     "tqdm",
+    "transformers",
+    "vaderSentiment",
 )
 
 ENVIRONMENT = {

@@ -36,9 +36,10 @@ LEARNERS_NEED = {
     "pyarrow",
     "threadpoolctl",
     "tqdm",
+    "transformers",
+    "vaderSentiment",
 }
 RECORDED = {".parquet", ".mp4", ".webp"}  # not policies: one could be handed in
-UNUSED = ("data", "models")  # of the library: language models and ratings, which no chapter uses yet
 MANIFEST = ".release.json"
 
 Recorded = Callable[[Chapter], assemble.Outputs | None]
@@ -114,7 +115,7 @@ def _library(chosen: list[Chapter], sources: Callable[[Chapter], Sources]) -> di
     files = {"course_lib/pyproject.toml": _pyproject().encode()}
     for path in sorted(paths.COURSE_LIB.rglob("*")):
         inside = path.relative_to(paths.COURSE_LIB)
-        if path.is_file() and inside.parts[0] not in ("frozen", "runs", *UNUSED) and "__pycache__" not in inside.parts:
+        if path.is_file() and inside.parts[0] not in ("frozen", "runs") and "__pycache__" not in inside.parts:
             files[f"course_lib/course_lib/{inside.as_posix()}"] = path.read_bytes()
     with tempfile.TemporaryDirectory() as folder:
         for chapter in chosen:

@@ -19,6 +19,7 @@ import psutil
 import pytest
 
 from autograder import bubblewrap, sandbox
+from autograder.paths import COURSE_LIB
 from autograder.sandbox import Limits, MiB, Sandbox, SandboxDied, SandboxGarbage, SandboxTimeout, SandboxUnavailable
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -125,6 +126,14 @@ def test_the_learners_packages_import_and_work_within_the_limits(ask):
         say([float(x.grad[0, 0]), os.path.getsize("figure.png") > 0, plt.get_backend(), torch.get_num_threads()])
     """
     assert ask(code, timeout=40) == [600.0, True, "Agg", 1]
+
+
+def test_a_cell_that_loads_the_tiny_language_model_runs(ask):
+    code = """
+        from course_lib import lm, preferences
+        say([lm.load("tiny").context, len(preferences.load("test").texts) > 100])
+    """
+    assert ask(code, timeout=40, modules=[COURSE_LIB]) == [128, True]
 
 
 def test_starting_costs_little_beside_the_interpreter(enter):
