@@ -23,12 +23,12 @@ IN_PLACE = "The caller's tensor is changed (by -=, *= or a method that ends in _
 
 def normal(generator: torch.Generator, *shape: int) -> torch.Tensor:
     """Standard normal numbers in double precision."""
-    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+    return torch.randn(shape, generator=generator, dtype=torch.float64)
 
 
 def uniform(generator: torch.Generator, *shape: int) -> torch.Tensor:
     """Numbers in [0, 1) in double precision."""
-    return torch.rand(*shape, generator=generator, dtype=torch.float64)
+    return torch.rand(shape, generator=generator, dtype=torch.float64)
 
 
 def integers(generator: torch.Generator, low: int, high: int, *shape: int) -> torch.Tensor:

@@ -155,3 +155,8 @@ class Adam:
         self.mean.copy_(state["mean"])
         self.square.copy_(state["square"])
         self.steps = state["steps"]
+
+
+def parameters(tensors) -> list[torch.nn.Parameter]:
+    """Tensors as the parameters of a network: each requires gradient."""
+    return [torch.nn.Parameter(tensor.clone()) for tensor in tensors]

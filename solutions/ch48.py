@@ -100,10 +100,7 @@ def temperature_loss(log_alpha, log_probs, target_entropy):
       target_entropy: H̄, in nats; a number.
 
     Returns: scalar tensor.
-    Raises: ValueError if log_alpha is not 0-dimensional.
     """
-    if log_alpha.dim():
-        raise ValueError(f"log_alpha must have shape (), got {tuple(log_alpha.shape)}")
     return -(log_alpha.exp() * (log_probs.detach() + target_entropy)).mean()
 
 
@@ -170,7 +167,7 @@ def bootstrap_interval(scores, confidence=0.95, num_resamples=2000, generator=No
     by_task = scores.reshape(len(scores), -1)  # (seeds, tasks)
     picks = torch.randint(len(by_task), (num_resamples, *by_task.shape), generator=generator)
     resampled = by_task.gather(0, picks.flatten(0, 1)).view(num_resamples, -1)
-    means = torch.stack([interquartile_mean(one) for one in resampled])
+    means = torch.vmap(interquartile_mean)(resampled)
     tail = (1 - confidence) / 2
     return means.quantile(tail), means.quantile(1 - tail)
 

@@ -1,0 +1,1291 @@
+"""Checks of chapter 48: cases, named misconceptions and correct variants for soft actor-critic and the statistics of comparisons."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
+from torch.nn import functional
+
+from autograder.mistakes import (
+    CUT,
+    SHAPES,
+    after,
+    cut_from_graph,
+    drawn_once,
+    dtype_lost,
+    in_place,
+    normal,
+    python_float,
+    refused,
+    replaced,
+    shape_cases,
+    uniform,
+    without,
+)
+from autograder.spec import Case, Exercise, Misconception
+from course_lib.cases import built
+from solutions import ch48
+
+HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
+
+
+def _same_shapes(**tensors):
+    """Another style of validation than the reference's."""
+    (first, expected), *others = ((name, tuple(tensor.shape)) for name, tensor in tensors.items())
+    for name, shape in others:
+        if shape != expected:
+            raise ValueError(f"{name} is of shape {shape}, but {first} is {expected}: they must agree")
+
+
+# ------------------------------------------------------------------------------------------- squashed_gaussian_log_prob
+
+_SQUASHED = ("mean", "log_std", "pre_tanh_actions")
+
+
+def _squashed(size=7, dims=3, reach=1.0):
+    """Pre-activations at `reach` standard deviations from the mean or so."""
+
+    def inputs(generator):
+        mean, log_std = normal(generator, size, dims), -0.5 + 0.4 * normal(generator, size, dims)
+        return {
+            "mean": mean,
+            "log_std": log_std,
+            "pre_tanh_actions": mean + reach * log_std.exp() * normal(generator, size, dims),
+        }
+
+    return inputs
+
+
+def _saturated(size=6, dims=2, low=12.0, high=60.0):
+    """Pre-activations whose hyperbolic tangent is ±1 to the computer, of policies that are sure of them."""
+
+    def inputs(generator):
+        signs = torch.where(uniform(generator, size, dims) < 0.5, -1.0, 1.0).double()
+        mean = signs * (low + (high - low) * uniform(generator, size, dims))
+        log_std = -0.5 + 0.3 * normal(generator, size, dims)
+        return {"mean": mean, "log_std": log_std, "pre_tanh_actions": mean + log_std.exp() * normal(generator, size, dims)}
+
+    return inputs
+
+
+def _at_rest(generator):
+    """u = μ = 0, where squashing changes nothing."""
+    drawn = _squashed()(generator)
+    return drawn | {"mean": torch.zeros_like(drawn["mean"]), "pre_tanh_actions": torch.zeros_like(drawn["mean"])}
+
+
+def _by_hyperbolic_cosine(mean, log_std, pre_tanh_actions):
+    """One number at a time: 1 - tanh² u = 1 / cosh² u."""
+    sums = []
+    for row in zip(mean.tolist(), log_std.tolist(), pre_tanh_actions.tolist(), strict=True):
+        total = 0.0
+        for m, s, u in zip(*row, strict=True):
+            log_cosh = abs(u) + math.log1p(math.exp(-2 * abs(u))) - math.log(2)
+            total += -0.5 * ((u - m) / math.exp(s)) ** 2 - s - HALF_LOG_TWO_PI + 2 * log_cosh
+        sums.append(total)
+    return torch.tensor(sums, dtype=mean.dtype)
+
+
+def _normal(m, s, u):
+    return -0.5 * ((u - m) / s.exp()) ** 2 - s - HALF_LOG_TWO_PI
+
+
+def _slope(u):
+    """log(1 - tanh² u), stable."""
+    return 2 * (math.log(2) - u - functional.softplus(-2 * u))
+
+
+def _density(formula, checked=True):
+    def version(mean, log_std, pre_tanh_actions):
+        if checked:
+            _same_shapes(mean=mean, log_std=log_std, pre_tanh_actions=pre_tanh_actions)
+        return formula(mean, log_std, pre_tanh_actions)
+
+    return version
+
+
+def _distribution_object(m, s, u):
+    squashed = TransformedDistribution(Independent(Normal(m, s.exp()), 1), [TanhTransform(cache_size=1)])
+    transform = squashed.transforms[-1]
+    return squashed.base_dist.log_prob(u) - transform.log_abs_det_jacobian(u, u.tanh()).sum(-1)
+
+
+SQUASHED_GAUSSIAN_LOG_PROB = Exercise(
+    name="squashed_gaussian_log_prob",
+    reference=ch48.squashed_gaussian_log_prob,
+    criteria={"values": 1.3, "gradient": 0.4, "dtype": 0.1, "inputs": 0.1, "errors": 0.1},
+    axes=("sample",),
+    cases=drawn_once(
+        Case("seven actions of three components", _squashed(), closed_form=_by_hyperbolic_cosine, visible=True, draws=2),
+        Case(
+            "at rest: the normal density",
+            _at_rest,
+            closed_form=lambda mean, log_std, pre_tanh_actions: -(log_std + HALF_LOG_TWO_PI).sum(-1),
+            visible=True,
+        ),
+        Case("a single component", _squashed(dims=1), closed_form=_by_hyperbolic_cosine, visible=True),
+        Case("as many samples as components", _squashed(4, 4), closed_form=_by_hyperbolic_cosine),
+        Case("far into saturation", _saturated(), closed_form=_by_hyperbolic_cosine, visible=True, draws=2),
+        Case("u of hundreds", _saturated(low=200.0, high=900.0), closed_form=_by_hyperbolic_cosine),
+        Case("all inputs require gradient", _squashed(), differentiate=_SQUASHED, visible=True, draws=2),
+        Case("gradient in saturation", _saturated(), differentiate=_SQUASHED),
+        Case("single precision", _squashed(), dtype=torch.float32, visible=True),
+        *shape_cases(_squashed(), _SQUASHED),
+    ),
+    misconceptions=(
+        Misconception(
+            "squashing-ignored",
+            _density(lambda m, s, u: _normal(m, s, u).sum(-1)),
+            "This is the density of u. tanh squeezes the line into (-1, 1), and the density of tanh(u) is higher by 1 / (1 - tanh² u)"
+            " in each component: subtract log(1 - tanh² u).",
+        ),
+        Misconception(
+            "correction-added",
+            _density(lambda m, s, u: (_normal(m, s, u) + _slope(u)).sum(-1)),
+            "The correction has the wrong sign: where tanh is flat, many u end up close together, and the density is higher.",
+        ),
+        Misconception(
+            "unstable",
+            _density(lambda m, s, u: (_normal(m, s, u) - (1 - u.tanh().square()).log()).sum(-1)),
+            "For |u| above 20 the tangent rounds to ±1, 1 - tanh² u to 0, and its logarithm is -inf:"
+            " 2 (log 2 - u - softplus(-2u)) is the same and is right everywhere.",
+        ),
+        Misconception(
+            "epsilon",
+            _density(lambda m, s, u: (_normal(m, s, u) - (1 - u.tanh().square() + 1e-6).log()).sum(-1)),
+            "The 1e-6 inside the logarithm avoids -inf, but the density of saturated actions is then wrong by any amount, and its"
+            " gradient is 0: use 2 (log 2 - u - softplus(-2u)).",
+        ),
+        Misconception(
+            "clamped",
+            _density(lambda m, s, u: (_normal(m, s, u) - (1 - u.tanh().square()).clamp(1e-6, 1).log()).sum(-1)),
+            "The clamp avoids -inf, but beyond it the density is wrong and its gradient 0: use 2 (log 2 - u - softplus(-2u)).",
+        ),
+        Misconception(
+            "slope-without-square",
+            _density(lambda m, s, u: (_normal(m, s, u) - (1 - u.tanh()).clamp_min(1e-300).log()).sum(-1)),
+            "The derivative of tanh u is 1 - tanh² u: the square is missing.",
+        ),
+        Misconception(
+            "squashed-action-in-the-normal-density",
+            _density(lambda m, s, u: (_normal(m, s, u.tanh()) - _slope(u)).sum(-1)),
+            "The normal density is that of u, before squashing: it is given tanh(u) here.",
+        ),
+        Misconception(
+            "mean-squashed",
+            _density(lambda m, s, u: (_normal(m.tanh(), s, u) - _slope(u)).sum(-1)),
+            "The mean of u is `mean` itself: only the action is squashed.",
+        ),
+        Misconception(
+            "log-std-taken-as-std",
+            _density(lambda m, s, u: (-0.5 * ((u - m) / s) ** 2 - s.abs().log() - HALF_LOG_TWO_PI - _slope(u)).sum(-1)),
+            "log_std is the logarithm of the standard deviation: take its exponential before dividing.",
+        ),
+        Misconception(
+            "correction-once",
+            _density(lambda m, s, u: _normal(m, s, u).sum(-1) - _slope(u).mean(-1)),
+            "Every component is squashed: sum the corrections, as the normal log-densities are summed.",
+        ),
+        Misconception(
+            "not-summed",
+            _density(lambda m, s, u: _normal(m, s, u) - _slope(u)),
+            "One number for each sample, (B,): the components are independent, so their log-densities add up.",
+        ),
+        Misconception(
+            "summed-over-samples",
+            _density(lambda m, s, u: (_normal(m, s, u) - _slope(u)).sum(0)),
+            "Sum over the action's components, the last axis, not over the samples.",
+        ),
+        Misconception(
+            "actions-detached",
+            _density(lambda m, s, u: (_normal(m, s, u.detach()) - _slope(u.detach())).sum(-1)),
+            "No gradient passes through pre_tanh_actions. In SAC the action is a function of the policy's outputs, u = μ + σ ε, and"
+            " without this path the policy's entropy never learns.",
+        ),
+        cut_from_graph(ch48.squashed_gaussian_log_prob),
+        dtype_lost(ch48.squashed_gaussian_log_prob),
+        in_place(ch48.squashed_gaussian_log_prob, "pre_tanh_actions", 2),
+        Misconception(
+            "bad-input-accepted", _density(lambda m, s, u: (_normal(m, s, u) - _slope(u)).sum(-1), checked=False), SHAPES
+        ),
+    ),
+    variants={
+        "distribution objects": _density(_distribution_object),
+        "log cosh": _density(
+            lambda m, s, u: (
+                Normal(m, s.exp()).log_prob(u) + 2 * (u.abs() + torch.log1p(torch.exp(-2 * u.abs())) - math.log(2))
+            ).sum(-1)
+        ),
+        "logsigmoid": _density(
+            lambda m, s, u: (_normal(m, s, u) - math.log(4) - functional.logsigmoid(2 * u) - functional.logsigmoid(-2 * u)).sum(
+                -1
+            )
+        ),
+        "logaddexp, component by component": _density(
+            lambda m, s, u: sum(
+                _normal(m[:, i], s[:, i], u[:, i]) - 2 * (math.log(2) - torch.logaddexp(u[:, i], -u[:, i]))
+                for i in range(u.shape[1])
+            )
+        ),
+        "in double precision": _density(
+            lambda m, s, u: (_normal(m.double(), s.double(), u.double()) - _slope(u.double())).sum(-1).to(m.dtype)
+        ),
+    },
+)
+
+# ---------------------------------------------------------------------------------------------------------- soft_q_target
+
+_TARGET = ("rewards", "next_q1", "next_q2", "next_log_probs")
+_TARGET_SHAPES = ("rewards", "terminated", "next_q1", "next_q2", "next_log_probs")
+
+
+def _steps(size=8, alpha=0.3, gamma=0.97, ends=None, **fixed):
+    """Steps of which about every third terminates, unless all or none do."""
+
+    def inputs(generator):
+        first = 20 + 5 * normal(generator, size)
+        terminated = uniform(generator, size) < 0.35
+        terminated[0], terminated[-1] = True, False
+        return {
+            "rewards": normal(generator, size),
+            "terminated": terminated if ends is None else torch.full_like(terminated, ends),
+            "next_q1": first,
+            "next_q2": first + 2 * normal(generator, size),
+            "next_log_probs": 1.5 + 3 * normal(generator, size),
+            "alpha": alpha,
+            "gamma": gamma,
+        } | fixed
+
+    return inputs
+
+
+def _alpha_tensor(generator):
+    return _steps()(generator) | {"alpha": torch.tensor(0.7, dtype=torch.float64)}
+
+
+def _target_by_steps(rewards, terminated, next_q1, next_q2, next_log_probs, alpha, gamma=0.99):
+    rows = zip(rewards.tolist(), terminated.tolist(), next_q1.tolist(), next_q2.tolist(), next_log_probs.tolist(), strict=True)
+    return torch.tensor(
+        [r if ended else r + gamma * (min(q1, q2) - float(alpha) * lp) for r, ended, q1, q2, lp in rows], dtype=rewards.dtype
+    )
+
+
+def _target(formula, checked=True, detached=True):
+    """A version: `formula` takes r, goes_on (0 or 1 in r's dtype), q1, q2, log_probs, alpha, gamma."""
+
+    def version(rewards, terminated, next_q1, next_q2, next_log_probs, alpha, gamma=0.99):
+        if checked:
+            _same_shapes(rewards=rewards, terminated=terminated, next_q1=next_q1, next_q2=next_q2, next_log_probs=next_log_probs)
+            if gamma < 0 or gamma > 1:
+                raise ValueError(f"gamma is a discount in [0, 1], received {gamma}")
+        goes_on = 1 - terminated.to(rewards.dtype)
+        result = formula(rewards, goes_on, next_q1, next_q2, next_log_probs, alpha, gamma)
+        return result.detach() if detached else result
+
+    return version
+
+
+def _soft(r, c, q1, q2, lp, alpha, gamma):
+    return r + gamma * c * (torch.minimum(q1, q2) - alpha * lp)
+
+
+def _masked_assignment(r, c, q1, q2, lp, alpha, gamma):
+    following = (torch.stack([q1, q2]).amin(0) - alpha * lp).clone()
+    following[c == 0] = 0
+    return r + gamma * following
+
+
+SOFT_Q_TARGET = Exercise(
+    name="soft_q_target",
+    reference=ch48.soft_q_target,
+    criteria={"values": 1.0, "gradient": 0.2, "dtype": 0.1, "inputs": 0.1, "errors": 0.1},
+    axes=("step",),
+    cases=drawn_once(
+        Case("eight steps", _steps(), closed_form=_target_by_steps, visible=True, draws=2),
+        Case("default gamma", without(_steps(), "gamma"), closed_form=_target_by_steps, visible=True),
+        Case(
+            "all steps terminate: the reward",
+            _steps(ends=True),
+            closed_form=lambda rewards, **_rest: rewards.clone(),
+            visible=True,
+        ),
+        Case("no step terminates", _steps(ends=False), closed_form=_target_by_steps),
+        Case("alpha = 0: a plain target", _steps(alpha=0.0), closed_form=_target_by_steps, visible=True),
+        Case("gamma = 1", _steps(gamma=1.0), closed_form=_target_by_steps),
+        Case("alpha is a tensor", _alpha_tensor, closed_form=_target_by_steps, visible=True),
+        Case("all inputs require gradient", _alpha_tensor, differentiate=(*_TARGET, "alpha"), visible=True, draws=2),
+        Case("single precision", _steps(), dtype=torch.float32, visible=True),
+        *shape_cases(_steps(), _TARGET_SHAPES),
+        refused(_steps(), gamma=1.2, visible=True),
+        refused(_steps(), gamma=-0.1),
+    ),
+    misconceptions=(
+        Misconception(
+            "maximum-of-the-critics",
+            _target(lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (torch.maximum(q1, q2) - alpha * lp)),
+            "This is the larger of the two values. The policy seeks out what is overestimated: the smaller one guards against that.",
+        ),
+        Misconception(
+            "mean-of-the-critics",
+            _target(lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (0.5 * (q1 + q2) - alpha * lp)),
+            "This is the mean of the two values: the minimum is what guards against overestimation.",
+        ),
+        Misconception(
+            "first-critic-only",
+            _target(lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (q1 - alpha * lp)),
+            "next_q2 is not used: the target takes the smaller of the two values.",
+        ),
+        Misconception(
+            "second-critic-only",
+            _target(lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (q2 - alpha * lp)),
+            "next_q1 is not used: the target takes the smaller of the two values.",
+        ),
+        Misconception(
+            "entropy-missing",
+            _target(lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * torch.minimum(q1, q2)),
+            "The next state's soft value is min(Q₁, Q₂) - α log π: the entropy term is missing, as in TD3.",
+        ),
+        Misconception(
+            "entropy-with-the-wrong-sign",
+            _target(lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (torch.minimum(q1, q2) + alpha * lp)),
+            "Randomness is rewarded: the entropy is -log π, so α log π is subtracted.",
+        ),
+        Misconception(
+            "alpha-missing",
+            _target(lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (torch.minimum(q1, q2) - lp)),
+            "alpha is not used: it is the price of a nat of entropy in units of reward.",
+        ),
+        Misconception(
+            "entropy-of-the-end",
+            _target(lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * (c * torch.minimum(q1, q2) - alpha * lp)),
+            "The entropy term is left standing where the task has ended: after the end no action is taken, and none is random.",
+        ),
+        Misconception(
+            "entropy-not-discounted",
+            _target(lambda r, c, q1, q2, lp, alpha, gamma: r + c * (gamma * torch.minimum(q1, q2) - alpha * lp)),
+            "The entropy is that of the next action, one step away: it is discounted as the value is.",
+        ),
+        Misconception(
+            "end-ignored",
+            _target(lambda r, c, q1, q2, lp, alpha, gamma: _soft(r, 1.0, q1, q2, lp, alpha, gamma)),
+            "terminated is not used: nothing follows where the task has ended.",
+        ),
+        Misconception(
+            "end-inverted",
+            _target(lambda r, c, q1, q2, lp, alpha, gamma: _soft(r, 1 - c, q1, q2, lp, alpha, gamma)),
+            "The bootstrap is kept where the task has ended and dropped where it goes on: multiply by 1 - terminated.",
+        ),
+        Misconception(
+            "reward-dropped-at-the-end",
+            _target(lambda r, c, q1, q2, lp, alpha, gamma: _soft(r, c, q1, q2, lp, alpha, gamma) * c),
+            "The last reward is paid, too: only what follows it falls away.",
+        ),
+        Misconception(
+            "gamma-missing",
+            _target(lambda r, c, q1, q2, lp, alpha, gamma: _soft(r, c, q1, q2, lp, alpha, 1.0)),
+            "What follows is not discounted: multiply it by gamma.",
+        ),
+        Misconception(
+            "gamma-on-the-reward",
+            _target(lambda r, c, q1, q2, lp, alpha, gamma: gamma * _soft(r, c, q1, q2, lp, alpha, 1.0)),
+            "The reward of this step is not discounted: gamma belongs to what follows.",
+        ),
+        Misconception(
+            "graph-kept",
+            _target(_soft, detached=False),
+            "A target is data. With a graph, the critics' loss also pulls at the target networks, the policy and the temperature:"
+            " compute it under torch.no_grad().",
+        ),
+        dtype_lost(ch48.soft_q_target),
+        in_place(ch48.soft_q_target, "rewards"),
+        Misconception("bad-input-accepted", _target(_soft, checked=False), SHAPES),
+    ),
+    variants={
+        "multiplied by 1 - terminated": _target(_soft),
+        "logical not": _target(lambda r, c, q1, q2, lp, alpha, gamma: r + (c > 0) * gamma * (torch.min(q1, q2) - alpha * lp)),
+        "filled with 0": _target(_masked_assignment),
+        "minimum by halves": _target(
+            lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (0.5 * (q1 + q2 - (q1 - q2).abs()) - alpha * lp)
+        ),
+        "step by step": _target(
+            lambda r, c, q1, q2, lp, alpha, gamma: torch.stack(
+                [r[i] + (gamma * (min(q1[i], q2[i]) - alpha * lp[i]) if c[i] else torch.zeros_like(r[i])) for i in range(len(r))]
+            )
+        ),
+    },
+)
+
+# ---------------------------------------------------------------------------------------------------------- sac_actor_loss
+
+_ACTOR = ("q1", "q2", "log_probs")
+
+
+def _judged(size=9, alpha=0.25):
+    def inputs(generator):
+        first = 3 + 4 * normal(generator, size)
+        return {
+            "q1": first,
+            "q2": first + 2 * normal(generator, size),
+            "log_probs": 1.0 + 2 * normal(generator, size),
+            "alpha": alpha,
+        }
+
+    return inputs
+
+
+def _judged_alpha_tensor(generator):
+    return _judged()(generator) | {"alpha": torch.tensor(0.6, dtype=torch.float64)}
+
+
+def _actor_by_samples(q1, q2, log_probs, alpha):
+    rows = zip(q1.tolist(), q2.tolist(), log_probs.tolist(), strict=True)
+    terms = [float(alpha) * lp - min(a, b) for a, b, lp in rows]
+    return torch.tensor(sum(terms) / len(terms), dtype=q1.dtype)
+
+
+def _actor(formula, checked=True, leak=False):
+    def version(q1, q2, log_probs, alpha):
+        if checked:
+            _same_shapes(q1=q1, q2=q2, log_probs=log_probs)
+        fixed = alpha.detach() if isinstance(alpha, torch.Tensor) and not leak else alpha
+        return formula(q1, q2, log_probs, fixed)
+
+    return version
+
+
+def _soft_value(q1, q2, lp, alpha):
+    return (alpha * lp - torch.minimum(q1, q2)).mean()
+
+
+SAC_ACTOR_LOSS = Exercise(
+    name="sac_actor_loss",
+    reference=ch48.sac_actor_loss,
+    criteria={"values": 0.6, "gradient": 0.2, "dtype": 0.05, "inputs": 0.05, "errors": 0.1},
+    cases=drawn_once(
+        Case("nine samples", _judged(), closed_form=_actor_by_samples, visible=True, draws=2),
+        Case(
+            "alpha = 0: minus the smaller value",
+            _judged(alpha=0.0),
+            closed_form=lambda q1, q2, **_rest: -torch.stack([q1, q2]).amin(0).mean(),
+            visible=True,
+        ),
+        Case("a single sample", _judged(1), closed_form=_actor_by_samples, visible=True),
+        Case("a high price of entropy", _judged(alpha=4.0), closed_form=_actor_by_samples),
+        Case("alpha is a tensor", _judged_alpha_tensor, closed_form=_actor_by_samples, visible=True),
+        Case("all inputs require gradient", _judged_alpha_tensor, differentiate=(*_ACTOR, "alpha"), visible=True, draws=2),
+        Case("single precision", _judged(), dtype=torch.float32, visible=True),
+        *shape_cases(_judged(), _ACTOR),
+    ),
+    misconceptions=(
+        Misconception(
+            "value-minimised",
+            _actor(lambda q1, q2, lp, alpha: (alpha * lp + torch.minimum(q1, q2)).mean()),
+            "A loss is minimised: with +Q the policy learns the worst actions.",
+        ),
+        Misconception(
+            "entropy-minimised",
+            _actor(lambda q1, q2, lp, alpha: (-alpha * lp - torch.minimum(q1, q2)).mean()),
+            "The entropy is -log π, and minimising -α log π makes the policy less random: the sign is wrong.",
+        ),
+        Misconception(
+            "objective-instead-of-loss",
+            _actor(lambda q1, q2, lp, alpha: -_soft_value(q1, q2, lp, alpha)),
+            "This is what the policy should maximise: a loss is minus that.",
+        ),
+        Misconception(
+            "maximum-of-the-critics",
+            _actor(lambda q1, q2, lp, alpha: (alpha * lp - torch.maximum(q1, q2)).mean()),
+            "This is the larger of the two values: the policy would chase every overestimate.",
+        ),
+        Misconception(
+            "mean-of-the-critics",
+            _actor(lambda q1, q2, lp, alpha: (alpha * lp - 0.5 * (q1 + q2)).mean()),
+            "This is the mean of the two values: take the smaller one, sample by sample.",
+        ),
+        Misconception(
+            "first-critic-only",
+            _actor(lambda q1, q2, lp, alpha: (alpha * lp - q1).mean()),
+            "q2 is not used: take the smaller of the two values, sample by sample.",
+        ),
+        Misconception(
+            "minimum-of-means",
+            _actor(lambda q1, q2, lp, alpha: (alpha * lp).mean() - torch.minimum(q1.mean(), q2.mean())),
+            "The minimum is taken for each sample, before the mean: here one critic judges the whole batch.",
+        ),
+        Misconception(
+            "alpha-missing",
+            _actor(lambda q1, q2, lp, alpha: (lp - torch.minimum(q1, q2)).mean()),
+            "alpha is not used: it is the price of a nat of entropy in units of reward.",
+        ),
+        Misconception(
+            "entropy-missing",
+            _actor(lambda q1, q2, lp, alpha: -torch.minimum(q1, q2).mean()),
+            "The entropy's worth is missing, and the policy's noise shrinks to nothing.",
+        ),
+        Misconception(
+            "summed",
+            _actor(lambda q1, q2, lp, alpha: (alpha * lp - torch.minimum(q1, q2)).sum()),
+            "This is the sum over the batch: take the mean, or the step grows with the batch.",
+        ),
+        Misconception(
+            "value-detached",
+            _actor(lambda q1, q2, lp, alpha: _soft_value(q1.detach(), q2.detach(), lp, alpha)),
+            "No gradient passes through the values, which is how the policy learns what pays: to keep the critics' weights fixed,"
+            " leave them out of the optimiser, not the values out of the graph.",
+        ),
+        Misconception(
+            "log-probs-detached",
+            _actor(lambda q1, q2, lp, alpha: _soft_value(q1, q2, lp.detach(), alpha)),
+            "No gradient passes through log_probs: the policy never learns to stay random.",
+        ),
+        Misconception(
+            "gradient-into-alpha",
+            _actor(_soft_value, leak=True),
+            "alpha gets gradient from the policy's loss, which would drive it to 0 or beyond: it has a loss of its own.",
+        ),
+        cut_from_graph(ch48.sac_actor_loss),
+        dtype_lost(ch48.sac_actor_loss),
+        in_place(ch48.sac_actor_loss, "q1"),
+        Misconception("bad-input-accepted", _actor(_soft_value, checked=False), SHAPES),
+    ),
+    variants={
+        "minus the soft value": _actor(lambda q1, q2, lp, alpha: -(torch.min(q1, q2) - alpha * lp).mean()),
+        "means apart": _actor(lambda q1, q2, lp, alpha: alpha * lp.mean() - torch.stack([q1, q2]).amin(0).mean()),
+        "sum over count": _actor(lambda q1, q2, lp, alpha: (lp.mul(alpha) - torch.where(q1 < q2, q1, q2)).sum() / len(lp)),
+        "sample by sample": _actor(
+            lambda q1, q2, lp, alpha: sum(alpha * lp[i] - min(q1[i], q2[i]) for i in range(len(lp))) / len(lp)
+        ),
+    },
+)
+
+# -------------------------------------------------------------------------------------------------------- temperature_loss
+
+
+def _temperature(size=9, log_alpha=-1.2, target_entropy=-3.0):
+    def inputs(generator):
+        return {
+            "log_alpha": log_alpha + 0.3 * normal(generator),
+            "log_probs": 1.5 + 2 * normal(generator, size),
+            "target_entropy": target_entropy,
+        }
+
+    return inputs
+
+
+def _on_target(generator):
+    """The batch's entropy is exactly the target."""
+    drawn = _temperature()(generator)
+    return drawn | {"log_probs": drawn["log_probs"] - drawn["log_probs"].mean() + 3.0}
+
+
+def _temperature_by_hand(log_alpha, log_probs, target_entropy):
+    mean = sum(log_probs.tolist()) / len(log_probs)
+    return torch.tensor(-math.exp(log_alpha.item()) * (mean + target_entropy), dtype=log_probs.dtype)
+
+
+TEMPERATURE_LOSS = Exercise(
+    name="temperature_loss",
+    reference=ch48.temperature_loss,
+    criteria={"values": 0.7, "gradient": 0.2, "dtype": 0.05, "inputs": 0.05},
+    cases=drawn_once(
+        Case("nine samples", _temperature(), closed_form=_temperature_by_hand, visible=True, draws=2),
+        Case(
+            "on target: nothing to change",
+            _on_target,
+            closed_form=lambda log_probs, **_rest: torch.zeros((), dtype=log_probs.dtype),
+            visible=True,
+        ),
+        Case("a single sample", _temperature(1), closed_form=_temperature_by_hand, visible=True),
+        Case("a positive target", _temperature(target_entropy=0.5), closed_form=_temperature_by_hand),
+        Case("a high temperature", _temperature(log_alpha=2.0), closed_form=_temperature_by_hand),
+        Case("all inputs require gradient", _temperature(), differentiate=("log_alpha", "log_probs"), visible=True, draws=2),
+        Case("single precision", _temperature(), dtype=torch.float32, visible=True),
+    ),
+    misconceptions=(
+        Misconception(
+            "sign-flipped",
+            lambda log_alpha, log_probs, target_entropy: (log_alpha.exp() * (log_probs.detach() + target_entropy)).mean(),
+            "The temperature falls where it should rise: while the policy's entropy, -mean(log π), is below the target, descending"
+            " the loss must make α larger.",
+        ),
+        Misconception(
+            "log-alpha-taken-as-alpha",
+            lambda log_alpha, log_probs, target_entropy: -(log_alpha * (log_probs.detach() + target_entropy)).mean(),
+            "α is exp(log_alpha). The loss with log α in place of α has another value and another gradient.",
+        ),
+        Misconception(
+            "target-subtracted",
+            lambda log_alpha, log_probs, target_entropy: -(log_alpha.exp() * (log_probs.detach() - target_entropy)).mean(),
+            "The policy's entropy is -log π: the difference between the target and it is log π + target_entropy.",
+        ),
+        Misconception(
+            "target-missing",
+            lambda log_alpha, log_probs, target_entropy: -(log_alpha.exp() * log_probs.detach()).mean(),
+            "target_entropy is not used: without it the temperature never settles.",
+        ),
+        Misconception(
+            "not-averaged",
+            lambda log_alpha, log_probs, target_entropy: -(log_alpha.exp() * (log_probs.detach() + target_entropy)),
+            "One number is asked for: take the mean over the batch.",
+        ),
+        Misconception(
+            "summed",
+            lambda log_alpha, log_probs, target_entropy: -(log_alpha.exp() * (log_probs.detach() + target_entropy)).sum(),
+            "This is the sum over the batch: take the mean, or the step grows with the batch.",
+        ),
+        Misconception(
+            "absolute-difference",
+            lambda log_alpha, log_probs, target_entropy: log_alpha.exp() * (log_probs.detach().mean() + target_entropy).abs(),
+            "The sign of the difference decides whether the temperature rises or falls: without it, it only falls.",
+        ),
+        Misconception(
+            "gradient-into-the-policy",
+            lambda log_alpha, log_probs, target_entropy: -(log_alpha.exp() * (log_probs + target_entropy)).mean(),
+            "log_probs get gradient: descending this loss would change the policy's entropy directly, in place of the temperature."
+            " Detach them.",
+        ),
+        Misconception(
+            "temperature-detached",
+            lambda log_alpha, log_probs, target_entropy: (
+                -(log_alpha.detach().exp() * (log_probs.detach() + target_entropy)).mean()
+            ),
+            CUT,
+        ),
+        python_float(ch48.temperature_loss),
+        dtype_lost(ch48.temperature_loss),
+        in_place(ch48.temperature_loss, "log_probs", 1),
+    ),
+    variants={
+        "mean first": lambda log_alpha, log_probs, target_entropy: (
+            -log_alpha.exp() * (log_probs.detach().mean() + target_entropy)
+        ),
+        "entropy minus target": lambda log_alpha, log_probs, target_entropy: (
+            (-log_probs.detach() - target_entropy) * torch.exp(log_alpha)
+        ).mean(),
+        "difference without gradient": lambda log_alpha, log_probs, target_entropy: (
+            (torch.e**log_alpha * -(log_probs.detach() + target_entropy)).sum() / log_probs.numel()
+        ),
+        "sample by sample": lambda log_alpha, log_probs, target_entropy: torch.stack(
+            [-torch.exp(log_alpha) * (one + target_entropy) for one in log_probs.detach()]
+        ).mean(),
+    },
+)
+
+# ----------------------------------------------------------------------------------------------------------- polyak_update
+
+_PAIR = ("target_params", "online_params")
+
+
+def _networks(tau=0.1, shapes=((3, 4), (4,), ()), parameters=()):
+    """Parameters of two networks; those named in `parameters` require gradient."""
+
+    def inputs(generator):
+        drawn = {name: [normal(generator, *shape) for shape in shapes] for name in _PAIR}
+        made = {name: built("networks.parameters", tensors=drawn[name]) if name in parameters else drawn[name] for name in _PAIR}
+        return made | {"tau": tau}
+
+    return inputs
+
+
+def _mismatch(change):
+    def inputs(generator):
+        drawn = _networks()(generator)
+        return drawn | {"online_params": [change(drawn["online_params"][0]), *drawn["online_params"][1:]]}
+
+    return inputs
+
+
+def _averaged(target_params, online_params, tau):
+    """What the targets should hold afterwards, as numbers."""
+    pairs = zip(target_params, online_params, strict=True)
+    return tuple(torch.from_numpy(np.asarray((1 - tau) * old.numpy() + tau * new.numpy())) for old, new in pairs)
+
+
+def _polyak(step, checked=True, graph=False):
+    """A version: `step(target, online, tau)` changes one tensor."""
+
+    def version(target_params, online_params, tau):
+        if checked and not 0 <= tau <= 1:
+            raise ValueError(f"tau is the weight of the new parameters, in [0, 1]: {tau}")
+        with torch.set_grad_enabled(graph):
+            for target, online in zip(target_params, online_params, strict=True):
+                if checked and target.shape != online.shape:
+                    raise ValueError(f"target_params and online_params differ: {tuple(target.shape)}, {tuple(online.shape)}")
+                step(target, online, tau)
+
+    return version
+
+
+def _first_only(target_params, online_params, tau):
+    targets, onlines = list(target_params), list(online_params)
+    ch48.polyak_update(targets[:1], onlines[:1], tau)
+    for target, online in zip(targets[1:], onlines[1:], strict=True):
+        if target.shape != online.shape:
+            raise ValueError(f"target_params {tuple(target.shape)} against online_params {tuple(online.shape)}")
+
+
+def _in_numpy(target, online, tau):
+    target.numpy()[...] = (1 - tau) * target.numpy() + tau * online.numpy()
+
+
+def _also_online(target, online, tau):
+    target.lerp_(online, tau)
+    online.copy_(target)
+
+
+def _rebound(target, online, tau):
+    target = (1 - tau) * target + tau * online
+
+
+POLYAK_UPDATE = Exercise(
+    name="polyak_update",
+    reference=ch48.polyak_update,
+    criteria={"values": 0.6, "gradient": 0.15, "dtype": 0.05, "inputs": 0.1, "errors": 0.1},
+    cases=drawn_once(
+        Case("tau = 0.1", _networks(), returns=("target_params",), visible=True, draws=2),
+        Case("tau = 0.005", _networks(0.005), returns=("target_params",), visible=True),
+        Case("tau = 0.5: half-way", _networks(0.5), returns=("target_params",)),
+        Case("tau = 0: nothing moves", _networks(0.0), returns=("target_params",), visible=True),
+        Case("tau = 1: a copy", _networks(1.0), returns=("target_params",)),
+        Case("one tensor", _networks(0.2, shapes=((5,),)), returns=("target_params",)),
+        Case("online parameters require gradient", _networks(parameters=_PAIR[1:]), returns=("target_params",), visible=True),
+        Case("all parameters require gradient", _networks(parameters=_PAIR), returns=("target_params",), visible=True),
+        Case("single precision", _networks(), returns=("target_params",), dtype=torch.float32, visible=True),
+        Case(
+            "a tensor of one row in place of three",
+            _mismatch(lambda tensor: tensor[:1]),
+            returns=("target_params",),
+            raises=_PAIR,
+            visible=True,
+        ),
+        Case("a tensor without its last axis", _mismatch(lambda tensor: tensor[0]), returns=("target_params",), raises=_PAIR),
+        Case("tau = 1.5", _networks(1.5), returns=("target_params",), raises=("tau",), visible=True),
+        Case("tau = -0.1", _networks(-0.1), returns=("target_params",), raises=("tau",)),
+    ),
+    misconceptions=(
+        Misconception(
+            "tau-on-the-wrong-side",
+            _polyak(lambda target, online, tau: target.lerp_(online, 1 - tau)),
+            "tau is the weight of the online parameters: with a small tau the targets move slowly, here they jump.",
+        ),
+        Misconception(
+            "copied",
+            _polyak(lambda target, online, tau: target.copy_(online)),
+            "This copies the online parameters: the targets are to move by a share tau of the distance.",
+        ),
+        Misconception(
+            "added",
+            _polyak(lambda target, online, tau: target.add_(tau * online)),
+            "The targets grow without bound: their old values are to be weighted with 1 - tau.",
+        ),
+        Misconception(
+            "moved-away",
+            _polyak(lambda target, online, tau: target.sub_(tau * (online - target))),
+            "The targets move away from the online parameters: the difference has the wrong sign.",
+        ),
+        Misconception(
+            "shrunk",
+            _polyak(lambda target, online, tau: target.mul_(1 - tau)),
+            "The online parameters' share is missing: add tau times theirs.",
+        ),
+        Misconception(
+            "weights-in-sequence",
+            _polyak(lambda target, online, tau: target.add_(tau * online).mul_(1 - tau)),
+            "The online share is shrunk by 1 - tau as well: multiply the targets first, then add.",
+        ),
+        Misconception(
+            "not-in-place",
+            _polyak(_rebound),
+            "target = … gives a name to a new tensor, and the network's own one stays as it is: use a method that ends in _.",
+        ),
+        Misconception(
+            "first-tensor-only",
+            _first_only,
+            "Only the first tensor is moved: every pair is to be.",
+        ),
+        Misconception(
+            "online-changed",
+            _polyak(_also_online),
+            "The online parameters are changed as well: they are what is being learnt, leave them as they are.",
+        ),
+        Misconception(
+            "graph-kept",
+            _polyak(lambda target, online, tau: target.mul_(1 - tau).add_(tau * online), graph=True),
+            "The update is recorded in the graph, which grows with every step, and PyTorch refuses to change parameters in place:"
+            " do it under torch.no_grad().",
+        ),
+        Misconception(
+            "bad-input-accepted",
+            _polyak(lambda target, online, tau: target.mul_(1 - tau).add_(tau * online), checked=False),
+            SHAPES,
+        ),
+    ),
+    variants={
+        "scaled, then added": _polyak(lambda target, online, tau: target.mul_(1 - tau).add_(online, alpha=tau)),
+        "by the difference": _polyak(lambda target, online, tau: target.add_(tau * (online - target))),
+        "copied from a sum": _polyak(lambda target, online, tau: target.copy_((1 - tau) * target + tau * online)),
+        "through .data": _polyak(
+            lambda target, online, tau: target.data.copy_(tau * online.data + (1 - tau) * target.data), graph=True
+        ),
+        "detached tensors, NumPy": _polyak(lambda target, online, tau: _in_numpy(target.detach(), online.detach(), tau)),
+    },
+)
+
+# ------------------------------------------------------------------------------------------------------ interquartile_mean
+
+
+def _scores(*shape, outlier=0.0):
+    def inputs(generator):
+        scores = 100 + 30 * normal(generator, *shape)
+        scores.view(-1)[int(uniform(generator, 1) * scores.numel())] += outlier
+        return {"scores": scores}
+
+    return inputs
+
+
+def _tasks_apart(seeds=5, tasks=3):
+    """Tasks on different levels: the middle half of all is not the mean of middle halves."""
+
+    def inputs(generator):
+        levels = torch.tensor([0.0, 40.0, 400.0], dtype=torch.float64)[:tasks]
+        return {"scores": levels + 10 * normal(generator, seeds, tasks)}
+
+    return inputs
+
+
+def _four_of_each(scores):
+    """Every score four times: then a quarter of the entries is a whole number."""
+    ordered = np.sort(np.repeat(scores.numpy().ravel(), 4))
+    quarter = len(ordered) // 4
+    return torch.tensor(ordered[quarter : len(ordered) - quarter].mean(), dtype=scores.dtype)
+
+
+def _sorted(formula):
+    return lambda scores: formula(scores.flatten().sort().values)
+
+
+def _trimmed(cut):
+    """The mean after whole entries were cut; `cut` says how many of n at each end."""
+    return _sorted(lambda x: x[cut(len(x)) : max(len(x) - cut(len(x)), cut(len(x)) + 1)].mean())
+
+
+def _between_quartiles(x):
+    low, high = x.quantile(0.25), x.quantile(0.75)
+    return x[(x >= low) & (x <= high)].mean()
+
+
+def _quantile_integral(x):
+    """The integral of the step function between 1/4 and 3/4."""
+    count = len(x)
+    total = torch.zeros((), dtype=x.dtype)
+    for i in range(count):
+        overlap = min((i + 1) / count, 0.75) - max(i / count, 0.25)
+        total = total + max(overlap, 0.0) * x[i]
+    return 2 * total
+
+
+def _edges_in_part(x):
+    count = len(x)
+    whole, part = divmod(count, 4)
+    inner = x[whole : count - whole].clone()
+    weights = torch.ones_like(inner)
+    if len(inner) == 1:
+        return inner[0]
+    weights[0] = weights[-1] = 1 - part / 4
+    return (weights * inner).sum() / weights.sum()
+
+
+INTERQUARTILE_MEAN = Exercise(
+    name="interquartile_mean",
+    reference=ch48.interquartile_mean,
+    criteria={"values": 0.85, "dtype": 0.1, "inputs": 0.05},
+    cases=drawn_once(
+        Case("eight seeds", _scores(8), closed_form=_four_of_each, visible=True, draws=2),
+        Case("five seeds", _scores(5), closed_form=_four_of_each, visible=True, draws=2),
+        Case("ten seeds, one of them lucky", _scores(10, outlier=5000.0), closed_form=_four_of_each, visible=True),
+        Case("seven seeds, one of them failed", _scores(7, outlier=-5000.0), closed_form=_four_of_each),
+        Case("six seeds", _scores(6), closed_form=_four_of_each),
+        Case("five seeds of three tasks", _tasks_apart(), closed_form=_four_of_each, visible=True, draws=2),
+        Case("four seeds of two tasks", _tasks_apart(4, 2), closed_form=_four_of_each),
+        Case("a single seed", _scores(1), closed_form=_four_of_each, visible=True),
+        Case("two seeds", _scores(2), closed_form=_four_of_each),
+        Case("single precision", _scores(9), dtype=torch.float32, visible=True),
+    ),
+    misconceptions=(
+        Misconception("mean", _sorted(torch.mean), "This is the mean of all scores: one lucky run moves it."),
+        Misconception(
+            "median",
+            _sorted(lambda x: x.quantile(0.5)),
+            "This is the median, which looks at one or two scores: the interquartile mean uses the middle half.",
+        ),
+        Misconception(
+            "whole-entries-rounded-down",
+            _trimmed(lambda n: n // 4),
+            "Too little is cut where the count is no multiple of 4: the scores at the edges count in part, so that the weights sum"
+            " to half of the count.",
+        ),
+        Misconception(
+            "whole-entries-rounded-up",
+            _trimmed(lambda n: -(-n // 4)),
+            "Too much is cut where the count is no multiple of 4: the scores at the edges count in part, so that the weights sum to"
+            " half of the count.",
+        ),
+        Misconception(
+            "a-quarter-in-all",
+            _sorted(lambda x: _cut_by_weight(x, 0.125)),
+            "A quarter is cut off in all: it is a quarter at each end, which leaves half.",
+        ),
+        Misconception(
+            "upper-half",
+            _sorted(lambda x: _cut_by_weight(x, 0.5, 0.0)),
+            "Both quarters are cut off at the lower end: the best runs are kept, and they are the lucky ones.",
+        ),
+        Misconception(
+            "mid-of-the-quartiles",
+            _sorted(lambda x: 0.5 * (x.quantile(0.25) + x.quantile(0.75))),
+            "This is the middle between the two quartiles: the interquartile mean averages the scores between them.",
+        ),
+        Misconception(
+            "between-interpolated-quartiles",
+            _sorted(_between_quartiles),
+            "The scores between torch.quantile's quartiles are no half of the weight: sort, and cut n / 4 at each end, the edges in"
+            " part.",
+        ),
+        Misconception(
+            "not-sorted",
+            lambda scores: _cut_by_weight(scores.flatten(), 0.25),
+            "The scores are cut in the order in which they came: sort them first.",
+        ),
+        Misconception(
+            "task-by-task",
+            lambda scores: torch.stack(
+                [ch48.interquartile_mean(column) for column in scores.reshape(len(scores), -1).unbind(1)]
+            ).mean(),
+            "All entries are taken together: here each task is trimmed for itself, and a task without a middle counts as much.",
+        ),
+        Misconception(
+            "one-number-for-each-task",
+            lambda scores: (
+                torch.stack([ch48.interquartile_mean(column) for column in scores.reshape(len(scores), -1).unbind(1)])
+                if scores.dim() > 1
+                else ch48.interquartile_mean(scores)
+            ),
+            "One number is asked for: flatten the scores before sorting.",
+        ),
+        python_float(ch48.interquartile_mean),
+        dtype_lost(ch48.interquartile_mean),
+        in_place(ch48.interquartile_mean, "scores"),
+    ),
+    variants={
+        "four of each": lambda scores: _middle_half(scores.flatten().repeat_interleave(4).sort().values),
+        "integral of the quantile function": _sorted(_quantile_integral),
+        "edges in part": _sorted(_edges_in_part),
+        "NumPy": lambda scores: torch.tensor(
+            np.interp([0.25, 0.75], np.linspace(0, 1, scores.numel() + 1), _cumulated(scores.numpy())) @ [-2.0, 2.0],
+            dtype=scores.dtype,
+        ),
+        "topk": lambda scores: _edges_in_part(scores.flatten().topk(scores.numel(), largest=False).values),
+    },
+)
+
+
+def _cut_by_weight(x, low, high=None):
+    """The mean of what is left when shares of the weight are cut off at both ends."""
+    count = len(x)
+    edges = torch.arange(count + 1, dtype=x.dtype).clamp(low * count, (1 - (low if high is None else high)) * count)
+    return edges.diff() @ x / edges.diff().sum()
+
+
+def _middle_half(ordered):
+    quarter = len(ordered) // 4
+    return ordered[quarter : 3 * quarter].mean()
+
+
+def _cumulated(scores):
+    return np.concatenate([[0.0], np.cumsum(np.sort(scores.ravel()))]) / scores.size
+
+
+# ------------------------------------------------------------------------------------------------------ bootstrap_interval
+
+HALVES = (0, 0, 0, 0, 1, 1, 1, 1)
+FEW = (0, 0, 1, 1)
+SKEWED = (0, 0, 0, 0, 0, 0, 1, 1, 1, 5)
+_SPARE = {"rtol": 1e-4, "atol": 1e-4}
+
+
+def _pattern(*columns, confidence=0.5, num_resamples=600):
+    """Few distinct scores, in random order and units. Their resampled means are few, too, and the ends of the interval fall on
+    them: then every right bootstrap gives the same numbers but for one draw in millions."""
+
+    def inputs(generator):
+        rows = torch.tensor(columns, dtype=torch.float64).T
+        rows = torch.stack([column[torch.randperm(len(column), generator=generator)] for column in rows.T], 1)
+        scale, shift = 1 + 9 * uniform(generator, 1), 100 * normal(generator, 1)
+        scores = shift + scale * rows
+        return {
+            "scores": scores[:, 0] if len(columns) == 1 else scores,
+            "confidence": confidence,
+            "num_resamples": num_resamples,
+            "generator": built("seeding.generator", seed=int(1e6 * uniform(generator, 1))),
+        }
+
+    return inputs
+
+
+def _together(generator):
+    """Two tasks in which the same seeds do well in one and badly in the other."""
+    drawn = _pattern(FEW)(generator)
+    first = drawn["scores"]
+    return drawn | {"scores": torch.stack([first, first.max() + first.min() - first], 1)}
+
+
+def _levels(generator):
+    """Tasks of different levels in which all seeds agree: nothing is uncertain."""
+    return _pattern((0,) * 6, (1,) * 6, (5,) * 6)(generator)
+
+
+def _certain(scores, **_rest):
+    return (ch48.interquartile_mean(scores),) * 2
+
+
+def _bootstrap(statistic=ch48.interquartile_mean, draw=None, tails=None, finish=None, own_generator=False):
+    """A version. `draw(by_task, count, generator)` gives (count, entries) resampled scores."""
+
+    def version(scores, confidence=0.95, num_resamples=2000, generator=None):
+        by_task = scores.reshape(len(scores), -1)
+        resampled = (draw or _stratified)(by_task, num_resamples, None if own_generator else generator)
+        means = statistic_of_rows(statistic, resampled)
+        low, high = tails(confidence) if tails else ((1 - confidence) / 2, (1 + confidence) / 2)
+        interval = means.quantile(low), means.quantile(high)
+        return finish(scores, means, *interval) if finish else interval
+
+    return version
+
+
+def statistic_of_rows(statistic, rows):
+    """The statistic of every row; the interquartile mean of all rows at once."""
+    if statistic is not ch48.interquartile_mean:
+        return statistic(rows)
+    count = rows.shape[1]
+    edges = torch.arange(count + 1, dtype=rows.dtype).clamp(count / 4, 3 * count / 4)
+    return rows.sort(1).values @ edges.diff() / (count / 2)
+
+
+def _stratified(by_task, count, generator):
+    picks = torch.randint(len(by_task), (count, *by_task.shape), generator=generator)
+    return by_task.gather(0, picks.flatten(0, 1)).view(count, -1)
+
+
+def _pooled(by_task, count, generator):
+    entries = by_task.flatten()
+    return entries[torch.randint(len(entries), (count, len(entries)), generator=generator)]
+
+
+def _whole_rows(by_task, count, generator):
+    return by_task[torch.randint(len(by_task), (count, len(by_task)), generator=generator)].flatten(1)
+
+
+def _shuffled(by_task, count, generator):
+    return _stratified(by_task, count, generator) * 0 + by_task.flatten()
+
+
+def _half_as_many(by_task, count, generator):
+    picks = torch.randint(len(by_task), (count, max(len(by_task) // 2, 1), by_task.shape[1]), generator=generator)
+    return by_task.gather(0, picks.flatten(0, 1)).view(count, -1)
+
+
+def _task_means(by_task, count, generator):
+    """Each task's own interquartile mean, then their average."""
+    picks = torch.randint(len(by_task), (count, *by_task.shape), generator=generator)
+    drawn = by_task.gather(0, picks.flatten(0, 1)).view(count, *by_task.shape)
+    columns = [statistic_of_rows(ch48.interquartile_mean, column) for column in drawn.unbind(2)]
+    return torch.stack(columns, 1).mean(1, keepdim=True)
+
+
+def _by_counts(by_task, count, generator):
+    """How often each seed is drawn, by a multinomial, and the scores repeated so often."""
+    rows = []
+    for _ in range(count):
+        columns = [
+            column[torch.multinomial(torch.ones(len(column)), len(column), replacement=True, generator=generator)]
+            for column in by_task.unbind(1)
+        ]
+        rows.append(torch.cat(columns))
+    return torch.stack(rows)
+
+
+def _by_floor(by_task, count, generator):
+    """Seeds by rounding down uniform numbers."""
+    size, tasks = by_task.shape
+    picks = (torch.rand((count, size, tasks), generator=generator, dtype=torch.float64) * size).long()
+    return torch.cat([by_task[picks[:, :, task], task] for task in range(tasks)], 1)
+
+
+def _by_loop(scores, confidence=0.95, num_resamples=2000, generator=None):
+    by_task = scores.reshape(len(scores), -1)
+    size, tasks = by_task.shape
+    means = []
+    for _ in range(num_resamples):
+        picks = torch.randint(0, size, (size, tasks), generator=generator)
+        means.append(_four_of_each(torch.gather(by_task, 0, picks)))
+    ordered = torch.stack(means).sort().values
+    tail = (1 - confidence) / 2
+    return ordered[int(tail * num_resamples)], ordered[int((1 - tail) * num_resamples) - 1]
+
+
+def _in_numpy_by_seed(scores, confidence=0.95, num_resamples=2000, generator=None):
+    """NumPy's generator, seeded from torch's."""
+    chance = np.random.default_rng(int(torch.randint(2**62, (1,), generator=generator)))
+    by_task = scores.numpy().reshape(len(scores), -1)
+    picks = chance.integers(len(by_task), size=(num_resamples, *by_task.shape))
+    drawn = np.take_along_axis(by_task[None], picks, axis=1).reshape(num_resamples, -1)
+    means = statistic_of_rows(ch48.interquartile_mean, torch.from_numpy(drawn)).numpy()
+    low, high = np.percentile(means, [50 * (1 - confidence), 50 * (1 + confidence)])
+    return torch.tensor(low, dtype=scores.dtype), torch.tensor(high, dtype=scores.dtype)
+
+
+def _around_the_centre(scores, means, low, high):
+    centre, spread = ch48.interquartile_mean(scores), means.std() * 1.96
+    return centre - spread, centre + spread
+
+
+def _mirrored(scores, means, low, high):
+    centre = ch48.interquartile_mean(scores)
+    return 2 * centre - high, 2 * centre - low
+
+
+BOOTSTRAP_INTERVAL = Exercise(
+    name="bootstrap_interval",
+    reference=ch48.bootstrap_interval,
+    criteria={"values": 1.3, "dtype": 0.1, "inputs": 0.1},
+    cases=drawn_once(
+        Case("eight seeds, half of them failed", _pattern(HALVES), visible=True, draws=2, **_SPARE),
+        Case(
+            "ten seeds, one of them lucky", _pattern(SKEWED, confidence=0.4, num_resamples=1000), visible=True, draws=2, **_SPARE
+        ),
+        Case("confidence 0.9", _pattern(HALVES, confidence=0.9, num_resamples=1000), **_SPARE),
+        Case(
+            "two tasks", _pattern(FEW, [score + 10 for score in FEW], confidence=0.7, num_resamples=700), visible=True, **_SPARE
+        ),
+        Case("two tasks in which seeds trade places", _together, visible=True, draws=2, **_SPARE),
+        Case("three tasks, all seeds alike: no width", _levels, closed_form=_certain, visible=True, **_SPARE),
+        Case("a single seed: no width", _pattern((3,)), closed_form=_certain, **_SPARE),
+        Case(
+            "default settings",
+            without(_pattern(HALVES), "confidence", "num_resamples"),
+            visible=True,
+            **_SPARE,
+        ),
+        Case("no generator", replaced(_pattern(HALVES), generator=None), **_SPARE),
+        Case("what is drawn from", _pattern(HALVES, num_resamples=20), returns=("generator",), view="drawn_from", visible=True),
+        Case("single precision", _pattern(HALVES), dtype=torch.float32, visible=True, **_SPARE),
+    ),
+    misconceptions=(
+        Misconception(
+            "mean-instead-of-the-interquartile-mean",
+            _bootstrap(lambda rows: rows.mean(1)),
+            "This is an interval for the mean: bootstrap the interquartile mean.",
+        ),
+        Misconception(
+            "median-instead-of-the-interquartile-mean",
+            _bootstrap(lambda rows: rows.quantile(0.5, dim=1)),
+            "This is an interval for the median: bootstrap the interquartile mean.",
+        ),
+        Misconception(
+            "tasks-mixed",
+            _bootstrap(draw=_pooled),
+            "Scores are drawn from all tasks together, so that a resample may hold one task twice as often as another, and the"
+            " interval is too wide: draw seeds within each task.",
+        ),
+        Misconception(
+            "whole-rows",
+            _bootstrap(draw=_whole_rows),
+            "The same seeds are drawn for all tasks, as if seed 3 of one task had anything to do with seed 3 of another: draw for each"
+            " task apart.",
+        ),
+        Misconception(
+            "without-replacement",
+            _bootstrap(draw=_shuffled),
+            "Every seed is drawn once, so that all resamples are the same and the interval has no width: draw with replacement.",
+        ),
+        Misconception(
+            "half-as-many",
+            _bootstrap(draw=_half_as_many),
+            "A resample has as many seeds as there are: with fewer the interval is too wide.",
+        ),
+        Misconception(
+            "tasks-averaged",
+            _bootstrap(statistic=lambda rows: rows[:, 0], draw=_task_means),
+            "Each task's interquartile mean is taken for itself: it is one mean over all entries of the resample.",
+        ),
+        Misconception(
+            "tails-not-halved",
+            _bootstrap(tails=lambda confidence: (1 - confidence, confidence)),
+            "1 - confidence is left out at each end: it is half of that, as there are two ends.",
+        ),
+        Misconception(
+            "one-sided",
+            _bootstrap(tails=lambda confidence: (0.0, confidence)),
+            "All that is left out is left out at the upper end: leave out (1 - confidence) / 2 at either end.",
+        ),
+        Misconception(
+            "extremes",
+            _bootstrap(tails=lambda confidence: (0.0, 1.0)),
+            "The smallest and the largest resampled mean are returned, which move apart with the number of resamples:"
+            " take the quantiles.",
+        ),
+        Misconception(
+            "normal-approximation",
+            _bootstrap(finish=_around_the_centre),
+            "Centre ± 1.96 standard deviations is symmetric and ignores `confidence`: a percentile interval takes quantiles of the"
+            " resampled means.",
+        ),
+        Misconception(
+            "mirrored",
+            _bootstrap(finish=_mirrored),
+            "This is the basic bootstrap, which mirrors the interval at the centre: the percentile interval takes the quantiles as"
+            " they are.",
+        ),
+        Misconception(
+            "ends-swapped",
+            _bootstrap(finish=lambda scores, means, low, high: (high, low)),
+            "The lower end comes first.",
+        ),
+        Misconception(
+            "own-generator",
+            _bootstrap(own_generator=True),
+            "Nothing is drawn from `generator`, so the interval is another one each time: hand it on to whatever draws.",
+        ),
+        Misconception(
+            "python-floats",
+            after(ch48.bootstrap_interval, lambda interval: tuple(end.item() for end in interval)),
+            "Return 0-dim tensors, not Python floats.",
+        ),
+        Misconception(
+            "dtype-lost",
+            after(ch48.bootstrap_interval, lambda interval: tuple(end.float() for end in interval)),
+            "The results have lost the scores' dtype.",
+        ),
+        in_place(ch48.bootstrap_interval, "scores"),
+    ),
+    variants={
+        "all resamples at once": _bootstrap(),
+        "rounded uniform numbers": _bootstrap(draw=_by_floor),
+        "resample by resample": _by_loop,
+        "multinomial": _bootstrap(draw=_by_counts),
+        "NumPy, seeded from the generator": _in_numpy_by_seed,
+    },
+)
+
+EXERCISES = (
+    SQUASHED_GAUSSIAN_LOG_PROB,
+    SOFT_Q_TARGET,
+    SAC_ACTOR_LOSS,
+    TEMPERATURE_LOSS,
+    POLYAK_UPDATE,
+    INTERQUARTILE_MEAN,
+    BOOTSTRAP_INTERVAL,
+)

@@ -1,0 +1,122 @@
+"""Reference solutions of chapter 51: learning a model of the world, imagining with it, and measuring where it fails."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from course_lib import validate
+
+
+def gaussian_nll(mean, log_var, targets):
+    """Negative log-likelihood of an ensemble of models that each predict a normal distribution.
+
+        L = mean(½ [log σ² + (y - μ)² / σ² + log 2π]),   σ² = exp(log_var)
+
+    over members, samples and dimensions; so every member learns as if it were alone.
+    Chua et al. (2018), section 4, https://arxiv.org/abs/1805.12114
+
+    Args:
+      mean: μ, the prediction of each of E members; (E, B, D). Receives gradient.
+      log_var: log σ², its uncertainty; (E, B, D). Receives gradient.
+      targets: y, what happened; (E, B, D) if each member sees samples of its own, or
+        (B, D) for all of them. No gradient.
+
+    Returns: scalar tensor, in nats.
+    Raises: ValueError if the shapes of mean and log_var differ, or that of targets is
+      neither theirs nor theirs without the first axis.
+    """
+    validate.same_shape(mean=mean, log_var=log_var)
+    targets = targets.detach()
+    validate.same_shape(mean=mean, targets=targets.expand_as(mean) if targets.shape == mean.shape[1:] else targets)
+    return 0.5 * (log_var + (targets - mean).square() * (-log_var).exp() + math.log(2 * math.pi)).mean()
+
+
+def imagine(model, policy, start_obs, horizon, generator):
+    """Let a policy act in a model instead of the world.
+
+    From each start one trajectory of `horizon` steps. Where the model says that one ends,
+    its `continues` are 0 from then on; what is written into its other entries after the
+    end does not matter.
+
+    Args:
+      model: `model(obs, actions, generator) -> (next_obs, rewards, continues)` with
+        (B, O), (B,) and (B,): continues is 1 where the trajectory goes on, 0 where the
+        step ended it.
+      policy: `policy(obs, generator) -> actions` (B, A).
+      start_obs: (B, O).
+      horizon: H ≥ 1, steps.
+      generator: torch generator, handed to the policy and to the model. At each step the
+        policy is called once, then the model once, for the whole batch.
+
+    Returns: dict of obs (H + 1, B, O), which begins with start_obs; actions (H, B, A),
+      rewards (H, B), and continues (H, B).
+    """
+    obs, actions, rewards, continues = [start_obs], [], [], []
+    alive = torch.ones_like(start_obs[:, 0])
+    for _ in range(horizon):
+        actions.append(policy(obs[-1], generator))
+        next_obs, reward, goes_on = model(obs[-1], actions[-1], generator)
+        alive = alive * goes_on
+        for column, entry in zip((obs, rewards, continues), (next_obs, reward, alive), strict=True):
+            column.append(entry)
+    columns = {"obs": obs, "actions": actions, "rewards": rewards, "continues": continues}
+    return {name: torch.stack(column) for name, column in columns.items()}
+
+
+def dreamer_lambda_returns(rewards, values, continues, gamma, lam):
+    """λ-returns of imagined trajectories, through which Dreamer's policy learns.
+
+        R_t = r_t + γ c_t [(1 - λ) v_t + λ R_{t+1}],   R_{H-1} = r_{H-1} + γ c_{H-1} v_{H-1}
+
+    Hafner et al. (2021), eq. 4, https://arxiv.org/abs/2010.02193; here v_t stands for the
+    value of the state that r_t led to.
+
+    Args:
+      rewards: r; (H, B). Receives gradient.
+      values: v, where values[t] belongs to the state after step t; (H, B). Receives
+        gradient.
+      continues: c, in [0, 1]: 0 where step t ended the trajectory; (H, B).
+      gamma: γ, in [0, 1].
+      lam: λ, in [0, 1].
+
+    Returns: (H, B), in units of reward.
+    Raises: ValueError if the shapes differ, or gamma or lam is outside [0, 1].
+    """
+    validate.same_shape(rewards=rewards, values=values, continues=continues)
+    validate.unit_interval(gamma=gamma, lam=lam)
+    returns, following = [], values[-1]
+    for reward, value, goes_on in zip(rewards.flip(0), values.flip(0), continues.flip(0), strict=True):
+        following = reward + gamma * goes_on * ((1 - lam) * value + lam * following)
+        returns.append(following)
+    return torch.stack(returns).flip(0)
+
+
+def model_error_by_horizon(model, obs, actions, generator):
+    """How far a model's prediction is off, the further it looks ahead.
+
+        e_h = √ mean((ŝ_h - s_h)²),   ŝ_0 = s_0,   ŝ_{h+1} from model(ŝ_h, a_h)
+
+    The model gets the actions that were really taken, and never a real observation after
+    the first. The mean is over samples and components.
+
+    Args:
+      model: as in `imagine`; whether it thinks that a trajectory ended does not matter.
+      obs: real trajectories, none of which ends; (H + 1, B, O).
+      actions: (H, B, A).
+      generator: torch generator, handed to the model, which is called once for each step.
+
+    Returns: (H,), for h = 1 to H, in units of the observations, without a graph.
+    Raises: ValueError if obs is not one step longer than actions, or their batches differ.
+    """
+    if len(obs) != len(actions) + 1 or obs.shape[1] != actions.shape[1]:
+        raise ValueError(
+            f"obs must have one step more than actions and the same batch, got obs {tuple(obs.shape)}, actions {tuple(actions.shape)}"
+        )
+    predicted, errors = obs[0], []
+    with torch.no_grad():
+        for real, taken in zip(obs[1:], actions, strict=True):
+            predicted, _, _ = model(predicted, taken, generator)
+            errors.append((predicted - real).square().mean().sqrt())
+    return torch.stack(errors)
