@@ -133,6 +133,31 @@ def training_curve(_arguments: dict[str, Any], outputs: dict[str, np.ndarray]) -
     }
 
 
+def until_the_end(_arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Imagined trajectories, with 0 in what comes after the end of each.
+
+    `outputs` has obs (H + 1, B, O), actions (H, B, A), rewards and continues (H, B). A step counts if the trajectory had not ended
+    before it; the observation that it led to counts, too. Entries whose shapes do not belong together are left as they are.
+    """
+    names = ("obs", "actions", "rewards", "continues")
+    if sorted(outputs) != sorted(names):
+        raise ValueError(f"the entries must be {', '.join(names)}")
+    obs, actions, rewards, continues = (outputs[name] for name in names)
+    steps, batch = continues.shape if continues.ndim == 2 else (0, 0)
+    if (obs.shape[:2], actions.shape[:2], rewards.shape) != ((steps + 1, batch), (steps, batch), (steps, batch)):
+        return dict(outputs)
+    if obs.ndim != 3 or actions.ndim != 3:
+        return dict(outputs)
+    begun = np.concatenate([np.ones((1, batch), bool), np.logical_and.accumulate(continues != 0)[:-1]])
+    seen = np.concatenate([np.ones((1, batch), bool), begun])
+    return {
+        "obs": np.where(seen[..., None], obs, 0),
+        "actions": np.where(begun[..., None], actions, 0),
+        "rewards": np.where(begun, rewards, 0),
+        "continues": continues,
+    }
+
+
 def _masks(outputs: dict[str, np.ndarray], paths: tuple[str, ...], size: int) -> list[np.ndarray]:
     masks = [outputs[path] for path in paths if path in outputs]
     if len(masks) < len(outputs) or len(masks) < len(paths) or any(mask.shape != (size,) for mask in masks):

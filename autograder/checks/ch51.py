@@ -1,0 +1,901 @@
+"""Checks of chapter 51: cases, named misconceptions and correct variants for learning from a model of the world."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch.distributions import Normal
+from torch.nn import functional
+
+from autograder.mistakes import (
+    CUT,
+    IN_PLACE,
+    SHAPES,
+    after,
+    drawn_once,
+    dtype_lost,
+    in_place,
+    normal,
+    python_float,
+    refused,
+    reshaped,
+    shape_cases,
+    uniform,
+)
+from autograder.spec import Case, Exercise, Misconception
+from course_lib.cases import built
+from solutions import ch51
+
+LOG_TWO_PI = math.log(2 * math.pi)
+
+# ------------------------------------------------------------------------------------------------------------ gaussian_nll
+
+_PREDICTED = ("mean", "log_var", "targets")
+
+
+def _ensemble(members=3, batch=5, dims=4, own_samples=False):
+    def inputs(generator):
+        shape = members, batch, dims
+        return {
+            "mean": normal(generator, *shape),
+            "log_var": -0.7 + 0.8 * normal(generator, *shape),
+            "targets": normal(generator, *(shape if own_samples else shape[1:])),
+        }
+
+    return inputs
+
+
+def _standard_and_right(generator):
+    """Every mean is right, and every variance 1."""
+    drawn = _ensemble()(generator)
+    return drawn | {"log_var": torch.zeros_like(drawn["mean"]), "mean": drawn["targets"].expand_as(drawn["mean"]).clone()}
+
+
+def _nll_by_hand(mean, log_var, targets):
+    rows = zip(mean.flatten().tolist(), log_var.flatten().tolist(), targets.expand_as(mean).flatten().tolist(), strict=True)
+    terms = [0.5 * (s + (y - m) ** 2 / math.exp(s) + LOG_TWO_PI) for m, s, y in rows]
+    return torch.tensor(sum(terms) / len(terms), dtype=mean.dtype)
+
+
+def _nll(formula, checked=True, leak=False):
+    def version(mean, log_var, targets):
+        if checked:
+            if mean.shape != log_var.shape:
+                raise ValueError(f"mean {tuple(mean.shape)} and log_var {tuple(log_var.shape)} must be alike")
+            if tuple(targets.shape) not in (tuple(mean.shape), tuple(mean.shape[1:])):
+                raise ValueError(f"targets of shape {tuple(targets.shape)} do not belong to a mean of {tuple(mean.shape)}")
+        return formula(mean, log_var, targets if leak else targets.detach())
+
+    return version
+
+
+def _terms(m, s, y):
+    return 0.5 * (s + (y - m) ** 2 / s.exp() + LOG_TWO_PI)
+
+
+def _averaged_prediction(m, s, y):
+    """The ensemble as one model: mean of means, mean of variances."""
+    y = y if y.dim() == 2 else y.mean(0)
+    return _terms(m.mean(0), s.exp().mean(0).log(), y).mean()
+
+
+GAUSSIAN_NLL = Exercise(
+    name="gaussian_nll",
+    reference=ch51.gaussian_nll,
+    criteria={"values": 1.2, "gradient": 0.4, "dtype": 0.1, "inputs": 0.1, "errors": 0.2},
+    cases=drawn_once(
+        Case("three members, targets for all", _ensemble(), closed_form=_nll_by_hand, visible=True, draws=2),
+        Case("three members, samples of their own", _ensemble(own_samples=True), closed_form=_nll_by_hand, visible=True, draws=2),
+        Case(
+            "right, with variance 1: half of log 2π",
+            _standard_and_right,
+            closed_form=lambda mean, **_rest: torch.tensor(0.5 * LOG_TWO_PI, dtype=mean.dtype),
+            visible=True,
+        ),
+        Case("as many members as samples", _ensemble(4, 4, 2), closed_form=_nll_by_hand),
+        Case("a single member", _ensemble(1, 6, 2), closed_form=_nll_by_hand),
+        Case("all inputs require gradient", _ensemble(), differentiate=_PREDICTED, visible=True, draws=2),
+        Case("own samples, gradient", _ensemble(own_samples=True), differentiate=_PREDICTED),
+        Case("single precision", _ensemble(), dtype=torch.float32, visible=True),
+        Case(
+            "log_var without its first member",
+            reshaped(_ensemble(), "log_var", lambda x: x[1:]),
+            raises=("log_var", "mean"),
+        ),
+        Case(
+            "log_var the same for all members",
+            reshaped(_ensemble(), "log_var", lambda x: x[:1]),
+            raises=("log_var", "mean"),
+            visible=True,
+        ),
+        Case(
+            "targets with one dimension",
+            reshaped(_ensemble(), "targets", lambda x: x[:, :1]),
+            raises=("targets", "mean"),
+            visible=True,
+        ),
+        Case("targets of one sample", reshaped(_ensemble(), "targets", lambda x: x[:1]), raises=("targets", "mean")),
+    ),
+    misconceptions=(
+        Misconception(
+            "squared-error",
+            _nll(lambda m, s, y: (y - m).square().mean()),
+            "This is the squared error: a model that knows how sure it is divides it by its variance and pays log σ².",
+        ),
+        Misconception(
+            "log-variance-missing",
+            _nll(lambda m, s, y: 0.5 * ((y - m) ** 2 / s.exp() + LOG_TWO_PI).mean()),
+            "Without the term log σ² the loss falls as the variance grows, for ever: the model learns to be sure of nothing.",
+        ),
+        Misconception(
+            "log-variance-with-the-wrong-sign",
+            _nll(lambda m, s, y: 0.5 * (-s + (y - m) ** 2 / s.exp() + LOG_TWO_PI).mean()),
+            "A wide distribution is a low one: log σ² is added to the loss.",
+        ),
+        Misconception(
+            "error-multiplied-by-the-variance",
+            _nll(lambda m, s, y: 0.5 * (s + (y - m) ** 2 * s.exp() + LOG_TWO_PI).mean()),
+            "The squared error is divided by the variance, that is, multiplied by exp(-log_var).",
+        ),
+        Misconception(
+            "log-var-taken-as-log-std",
+            _nll(lambda m, s, y: 0.5 * (2 * s + (y - m) ** 2 / (2 * s).exp() + LOG_TWO_PI).mean()),
+            "log_var is log σ², not log σ: the variance is exp(log_var).",
+        ),
+        Misconception(
+            "log-var-taken-as-variance",
+            _nll(lambda m, s, y: 0.5 * (s.abs().log() + (y - m) ** 2 / s + LOG_TWO_PI).mean()),
+            "log_var is the logarithm of the variance: take its exponential.",
+        ),
+        Misconception(
+            "error-not-squared",
+            _nll(lambda m, s, y: 0.5 * (s + (y - m).abs() / s.exp() + LOG_TWO_PI).mean()),
+            "The exponent of the normal density has the error squared.",
+        ),
+        Misconception(
+            "half-missing",
+            _nll(lambda m, s, y: (s + (y - m) ** 2 / s.exp() + LOG_TWO_PI).mean()),
+            "This is twice the negative log-likelihood: the half is missing.",
+        ),
+        Misconception(
+            "half-of-the-error-only",
+            _nll(lambda m, s, y: (s + 0.5 * (y - m) ** 2 / s.exp() + 0.5 * LOG_TWO_PI).mean()),
+            "log σ is half of log σ²: log_var has no half here, and the variances come out too small.",
+        ),
+        Misconception(
+            "two-pi-missing",
+            _nll(lambda m, s, y: 0.5 * (s + (y - m) ** 2 / s.exp()).mean()),
+            "The constant ½ log 2π is missing: it moves no gradient, but what is reported is no likelihood.",
+        ),
+        Misconception(
+            "likelihood",
+            _nll(lambda m, s, y: -_terms(m, s, y).mean()),
+            "This is the log-likelihood: a loss is minus that.",
+        ),
+        Misconception(
+            "summed-over-dimensions",
+            _nll(lambda m, s, y: _terms(m, s, y).sum(-1).mean()),
+            "The mean over every element is asked for: here the dimensions are summed.",
+        ),
+        Misconception(
+            "summed-over-members",
+            _nll(lambda m, s, y: _terms(m, s, y).mean((1, 2)).sum()),
+            "The mean over every element is asked for: here the members are summed.",
+        ),
+        Misconception(
+            "summed",
+            _nll(lambda m, s, y: _terms(m, s, y).sum()),
+            "This is a sum: the mean over every element is asked for.",
+        ),
+        Misconception(
+            "one-loss-for-each-member",
+            _nll(lambda m, s, y: _terms(m, s, y).mean((1, 2))),
+            "One number is asked for: the mean over the members as well.",
+        ),
+        Misconception(
+            "ensemble-averaged-first",
+            _nll(_averaged_prediction),
+            "The members' predictions are averaged before they are judged. Then only the average has to be right, and their"
+            " disagreement no longer says where the model is unsure: each member is to be judged for itself.",
+        ),
+        Misconception(
+            "variance-detached",
+            _nll(lambda m, s, y: _terms(m, s.detach(), y).mean()),
+            "No gradient reaches log_var: the model never learns how sure it may be.",
+        ),
+        Misconception(
+            "gradient-into-targets", _nll(lambda m, s, y: _terms(m, s, y).mean(), leak=True), "Targets are data: detach them."
+        ),
+        python_float(ch51.gaussian_nll),
+        dtype_lost(ch51.gaussian_nll),
+        in_place(ch51.gaussian_nll, "mean"),
+        Misconception("bad-input-accepted", _nll(lambda m, s, y: _terms(m, s, y).mean(), checked=False), SHAPES),
+    ),
+    variants={
+        "torch.distributions": _nll(lambda m, s, y: -Normal(m, (0.5 * s).exp()).log_prob(y).mean()),
+        "PyTorch's own loss": _nll(
+            lambda m, s, y: functional.gaussian_nll_loss(m, y.expand_as(m), s.exp(), full=True, eps=1e-12)
+        ),
+        "member by member": _nll(
+            lambda m, s, y: torch.stack([_terms(m[e], s[e], y if y.dim() == 2 else y[e]).mean() for e in range(len(m))]).mean()
+        ),
+        "terms apart": _nll(lambda m, s, y: 0.5 * s.mean() + 0.5 * ((y - m) * (-0.5 * s).exp()).pow(2).mean() + 0.5 * LOG_TWO_PI),
+        "in double precision": _nll(lambda m, s, y: _terms(m.double(), s.double(), y.double()).mean().to(m.dtype)),
+    },
+)
+
+# ----------------------------------------------------------------------------------------------------------------- imagine
+
+
+def _world(generator, obs_dim, action_dim, noise, limit):
+    """A linear model and a linear policy, as descriptions; noise in one of them is noise in both."""
+    dynamics = torch.eye(obs_dim, dtype=torch.float64) + 0.3 * normal(generator, obs_dim, obs_dim)
+    model = built(
+        "dynamics.LinearModel",
+        dynamics=dynamics,
+        control=normal(generator, action_dim, obs_dim),
+        noise=noise,
+        limit=limit,
+        drift=2.0,
+    )
+    return model, built("dynamics.LinearPolicy", gains=0.4 * normal(generator, obs_dim, action_dim), noise=noise)
+
+
+def _dreams(batch=6, obs_dim=3, action_dim=2, horizon=5, noise=0.0, limit=math.inf):
+    def inputs(generator):
+        model, policy = _world(generator, obs_dim, action_dim, noise, limit)
+        return {
+            "model": model,
+            "policy": policy,
+            "start_obs": 0.5 * normal(generator, batch, obs_dim),
+            "horizon": horizon,
+            "generator": built("seeding.generator", seed=int(1e6 * uniform(generator, 1))),
+        }
+
+    return inputs
+
+
+def _ending(generator):
+    """One trajectory ends with its first step and leaves the bounds; the others never do. After the end the model says that the
+    trajectory goes on again."""
+    drawn = _dreams(batch=4, obs_dim=2, action_dim=1, horizon=4)(generator)
+    turn = torch.tensor([[0.0, 1.0], [-1.0, 0.0]], dtype=torch.float64)  # a quarter of a turn: the first component comes back
+    drawn["model"] = built(
+        "dynamics.LinearModel", dynamics=turn, control=torch.zeros(1, 2, dtype=torch.float64), limit=1.0, drift=2.0
+    )
+    start = 0.2 + 0.3 * uniform(generator, 4, 2)
+    start[1, 1], start[2, 0] = 3.0, 5.0  # what is second now is first after a step; what is first, after two
+    return drawn | {"start_obs": start}
+
+
+def _view(name, inputs, **options):
+    return Case(name, inputs, view="until_the_end", **options)
+
+
+def _stacked(obs, actions, rewards, continues):
+    return {
+        "obs": torch.stack(obs),
+        "actions": torch.stack(actions),
+        "rewards": torch.stack(rewards),
+        "continues": torch.stack(continues),
+    }
+
+
+def _dream(
+    condition=lambda start, latest: latest,
+    act=lambda policy, obs, generator: policy(obs, generator),
+    step=lambda model, obs, actions, generator: model(obs, actions, generator),
+    ends=lambda alive, goes_on: alive * goes_on,
+    finish=lambda result: result,
+    before=lambda model, policy, obs, generator: None,
+):
+    """A version of imagine, each part of which can be another."""
+
+    def version(model, policy, start_obs, horizon, generator):
+        obs, actions, rewards, continues = [start_obs], [], [], []
+        alive = torch.ones(len(start_obs), dtype=start_obs.dtype)
+        for _ in range(horizon):
+            seen = condition(start_obs, obs[-1])
+            before(model, policy, seen, generator)
+            chosen = act(policy, seen, generator)
+            following, reward, goes_on = step(model, seen, chosen, generator)
+            alive = ends(alive, goes_on)
+            obs.append(following)
+            actions.append(chosen)
+            rewards.append(reward)
+            continues.append(alive)
+        return finish(_stacked(obs, actions, rewards, continues))
+
+    return version
+
+
+def _without_start(result):
+    return result | {"obs": result["obs"][1:]}
+
+
+def _without_end(result):
+    return result | {"obs": result["obs"][:-1]}
+
+
+def _batch_first(result):
+    return {name: column.transpose(0, 1) for name, column in result.items()}
+
+
+def _row_by_row(model, policy, start_obs, horizon, generator):
+    """One trajectory after the other."""
+    rows = [ch51.imagine(model, policy, start[None], horizon, generator) for start in start_obs]
+    return {name: torch.cat([row[name] for row in rows], 1) for name in rows[0]}
+
+
+def _filled(model, policy, start_obs, horizon, generator):
+    """Into arrays that were made before."""
+    batch, obs_dim = start_obs.shape
+    obs = start_obs.new_zeros(horizon + 1, batch, obs_dim)
+    rewards, continues = start_obs.new_zeros(horizon, batch), start_obs.new_ones(horizon, batch)
+    obs[0] = start_obs
+    actions = []
+    for t in range(horizon):
+        actions.append(policy(obs[t], generator))
+        obs[t + 1], rewards[t], continues[t] = model(obs[t], actions[t], generator)
+    return {"obs": obs, "actions": torch.stack(actions), "rewards": rewards, "continues": continues.cumprod(0)}
+
+
+def _frozen_after_the_end(model, policy, start_obs, horizon, generator):
+    """Trajectories that have ended stay where they are, and earn nothing."""
+    obs, actions, rewards, continues = [start_obs], [], [], []
+    alive = torch.ones(len(start_obs), dtype=torch.bool)
+    for _ in range(horizon):
+        action = policy(obs[-1], generator)
+        following, reward, goes_on = model(obs[-1], action, generator)
+        obs.append(torch.where(alive[:, None], following, obs[-1]))
+        actions.append(action)
+        rewards.append(torch.where(alive, reward, 0))
+        alive = alive & (goes_on > 0)
+        continues.append(alive.to(start_obs.dtype))
+    return _stacked(obs, actions, rewards, continues)
+
+
+def _recursive(model, policy, start_obs, horizon, generator):
+    def onwards(obs, alive, left):
+        if not left:
+            return []
+        action = policy(obs, generator)
+        following, reward, goes_on = model(obs, action, generator)
+        alive = torch.minimum(alive, goes_on)
+        return [(following, action, reward, alive), *onwards(following, alive, left - 1)]
+
+    obs, actions, rewards, continues = zip(*onwards(start_obs, torch.ones_like(start_obs[:, 0]), horizon), strict=True)
+    return _stacked([start_obs, *obs], actions, rewards, continues)
+
+
+def _in_place_at_the_end(model, policy, start_obs, horizon, generator):
+    result = ch51.imagine(model, policy, start_obs, horizon, generator)
+    start_obs.copy_(result["obs"][-1])
+    return result
+
+
+def _delayed(continues):
+    return torch.cat([torch.ones_like(continues[:1]), continues[:-1]])
+
+
+IMAGINE = Exercise(
+    name="imagine",
+    reference=ch51.imagine,
+    criteria={"values": 1.7, "dtype": 0.1, "inputs": 0.2},
+    axes=("t", "trajectory"),
+    cases=drawn_once(
+        _view("five steps, no noise", _dreams(), visible=True, draws=2),
+        _view("noise in the policy and the model", _dreams(noise=0.3), visible=True, draws=2),
+        _view("trajectories that end", _ending, visible=True, draws=2),
+        _view("one step", _dreams(horizon=1), visible=True),
+        _view("a single start", _dreams(batch=1)),
+        _view("as many starts as steps", _dreams(batch=4, horizon=4, obs_dim=4)),
+        Case("calls of the model and of the policy", _dreams(noise=0.3), returns=("model", "policy"), visible=True),
+        _view("single precision", _dreams(), dtype=torch.float32, visible=True),
+    ),
+    misconceptions=(
+        Misconception(
+            "always-from-the-start",
+            _dream(condition=lambda start, latest: start),
+            "Every step begins at start_obs again: the next one begins where the last one led to.",
+        ),
+        Misconception(
+            "end-forgotten",
+            _dream(ends=lambda alive, goes_on: goes_on),
+            "A trajectory that has ended comes back to life as soon as the model finds its state harmless: once continues is 0, it"
+            " stays 0.",
+        ),
+        Misconception(
+            "end-a-step-late",
+            _dream(finish=lambda result: result | {"continues": _delayed(result["continues"])}),
+            "continues[t] says whether the trajectory goes on after step t, not whether it had ended before it.",
+        ),
+        Misconception(
+            "never-ends",
+            _dream(ends=lambda alive, goes_on: alive),
+            "What the model says about the end is not used.",
+        ),
+        Misconception(
+            "ends-instead-of-continues",
+            _dream(finish=lambda result: result | {"continues": 1 - result["continues"]}),
+            "This is 1 where the trajectory has ended: continues is 1 where it goes on.",
+        ),
+        Misconception(
+            "all-end-together",
+            _dream(ends=lambda alive, goes_on: alive * goes_on.min()),
+            "Where one trajectory ends, all do here: each has its own end.",
+        ),
+        Misconception("start-left-out", _dream(finish=_without_start), "obs begins with start_obs: it has H + 1 entries."),
+        Misconception(
+            "last-state-left-out",
+            _dream(finish=_without_end),
+            "The state that the last step led to is missing: obs has H + 1 entries, and the last value is bootstrapped from it.",
+        ),
+        Misconception(
+            "batch-first",
+            _dream(finish=_batch_first),
+            "Time comes first: (H, B), not (B, H).",
+        ),
+        Misconception(
+            "policy-asked-twice",
+            _dream(before=lambda model, policy, obs, generator: policy(obs, generator)),
+            "The policy is called more than once in a step: what is recorded must be the action that the model was given.",
+        ),
+        Misconception(
+            "trajectory-by-trajectory",
+            _row_by_row,
+            "The model is called for each trajectory apart: one call for the whole batch does the same in a fraction of the time.",
+        ),
+        Misconception(
+            "dtype-lost",
+            after(ch51.imagine, lambda result: {name: column.float() for name, column in result.items()}),
+            "The results have lost the dtype of start_obs.",
+        ),
+        Misconception(
+            "input-changed",
+            _in_place_at_the_end,
+            IN_PLACE,
+        ),
+    ),
+    variants={
+        "into arrays made before": _filled,
+        "frozen after the end": _frozen_after_the_end,
+        "recursion": _recursive,
+        "cumulative product": _dream(
+            ends=lambda alive, goes_on: goes_on,
+            finish=lambda result: result | {"continues": result["continues"].cumprod(0)},
+        ),
+    },
+)
+
+
+# --------------------------------------------------------------------------------------------------- dreamer_lambda_returns
+
+_IMAGINED = ("rewards", "values", "continues")
+
+
+def _imagined(steps=6, batch=4, gamma=0.95, lam=0.8, ends=0.2):
+    def inputs(generator):
+        return {
+            "rewards": normal(generator, steps, batch),
+            "values": 5 + 3 * normal(generator, steps, batch),
+            "continues": (uniform(generator, steps, batch) >= ends).double(),
+            "gamma": gamma,
+            "lam": lam,
+        }
+
+    return inputs
+
+
+def _fractions(generator):
+    """A model that is not sure whether the trajectory goes on."""
+    drawn = _imagined()(generator)
+    return drawn | {"continues": uniform(generator, *drawn["rewards"].shape)}
+
+
+def _as_sum(rewards, values, continues, gamma, lam):
+    """R_t as the weighted sum of n-step returns."""
+    steps = len(rewards)
+    result = torch.zeros_like(rewards)
+    for t in range(steps):
+        discount, total, weight = torch.ones_like(rewards[0]), torch.zeros_like(rewards[0]), 1.0
+        for k in range(t, steps):
+            total = total + discount * rewards[k]
+            discount = discount * gamma * continues[k]
+            n_step = total + discount * values[k]
+            share = weight * (1 - lam) if k < steps - 1 else weight
+            result[t] = result[t] + share * n_step
+            weight *= lam
+    return result
+
+
+def _monte_carlo(rewards, values, continues, gamma, **_rest):
+    return _as_sum(rewards, values, continues, gamma, 1.0)
+
+
+def _one_step(rewards, values, continues, gamma, **_rest):
+    return rewards + gamma * continues * values
+
+
+def _dreamer(formula, checked=True):
+    def version(rewards, values, continues, gamma, lam):
+        if checked:
+            if not rewards.shape == values.shape == continues.shape:
+                shapes = [tuple(x.shape) for x in (rewards, values, continues)]
+                raise ValueError(f"rewards, values and continues must be of one shape, not {shapes}")
+            for name, value in (("gamma", gamma), ("lam", lam)):
+                if value < 0 or value > 1:
+                    raise ValueError(f"{name} = {value} is outside [0, 1]")
+        return formula(rewards, values, continues, gamma, lam)
+
+    return version
+
+
+def _backwards(mix, last=lambda v: v[-1]):
+    """A recursion: `mix` takes r, v, c, what follows, gamma, lam of one step."""
+
+    def formula(r, v, c, gamma, lam):
+        following, found = last(v), []
+        for t in reversed(range(min(len(r), len(v), len(c)))):
+            following = mix(r[t], v[t], c[t], following, gamma, lam)
+            found.insert(0, following)
+        return torch.stack(found)
+
+    return formula
+
+
+def _right(r, v, c, following, gamma, lam):
+    return r + gamma * c * ((1 - lam) * v + lam * following)
+
+
+def _values_of_the_same_state(r, v, c, gamma, lam):
+    """values[t] taken as the value before step t: the bootstrap is values[t + 1], and what is last has none left but itself."""
+    return _backwards(_right)(r, torch.cat([v[1:], v[-1:]]), c, gamma, lam)
+
+
+def _forwards(r, v, c, gamma, lam):
+    following, found = v[0], []
+    for t in range(len(r)):
+        following = _right(r[t], v[t], c[t], following, gamma, lam)
+        found.append(following)
+    return torch.stack(found)
+
+
+def _from_deltas(r, v, c, gamma, lam):
+    """As a generalised advantage on top of one-step targets."""
+    targets, above = r + gamma * c * v, torch.zeros_like(r[0])
+    found = [targets[-1]]
+    for t in reversed(range(len(r) - 1)):
+        above = gamma * lam * c[t] * (found[0] - v[t])
+        found.insert(0, targets[t] + above)
+    return torch.stack(found)
+
+
+def _by_matrix(r, v, c, gamma, lam):
+    """The recursion is linear: solve for all steps at once."""
+    steps, batch = r.shape
+    share = lam * torch.ones(steps, 1, dtype=r.dtype)
+    share[-1] = 0
+    constant = r + gamma * c * (1 - share) * v
+    columns = []
+    for b in range(batch):
+        coupling = torch.diag((gamma * c[:, b] * share[:, 0])[:-1], 1) if steps > 1 else torch.zeros(1, 1, dtype=r.dtype)
+        columns.append(torch.linalg.solve(torch.eye(steps, dtype=r.dtype) - coupling, constant[:, b]))
+    return torch.stack(columns, 1)
+
+
+DREAMER_LAMBDA_RETURNS = Exercise(
+    name="dreamer_lambda_returns",
+    reference=ch51.dreamer_lambda_returns,
+    criteria={"values": 1.2, "gradient": 0.4, "dtype": 0.1, "inputs": 0.1, "errors": 0.2},
+    axes=("t", "trajectory"),
+    last_step_first=True,
+    cases=drawn_once(
+        Case("six steps", _imagined(), closed_form=_as_sum, visible=True, draws=2),
+        Case("no ends", _imagined(ends=0.0), closed_form=_as_sum, visible=True),
+        Case("lam = 0: one step and the next value", _imagined(lam=0.0), closed_form=_one_step, visible=True),
+        Case("lam = 1: all rewards and the last value", _imagined(lam=1.0, ends=0.0), closed_form=_monte_carlo, visible=True),
+        Case("gamma = 1", _imagined(gamma=1.0), closed_form=_as_sum),
+        Case("one step", _imagined(1), closed_form=_as_sum),
+        Case("as many trajectories as steps", _imagined(5, 5), closed_form=_as_sum),
+        Case("a model that is not sure of the end", _fractions, closed_form=_as_sum, visible=True),
+        Case("rewards and values require gradient", _imagined(), differentiate=("rewards", "values"), visible=True, draws=2),
+        Case("single precision", _imagined(), dtype=torch.float32, visible=True),
+        *shape_cases(_imagined(), _IMAGINED),
+        refused(_imagined(), gamma=1.1, visible=True),
+        refused(_imagined(), lam=-0.2, visible=True),
+        refused(_imagined(), lam=1.5),
+    ),
+    misconceptions=(
+        Misconception(
+            "values-of-the-state-before",
+            _dreamer(_values_of_the_same_state),
+            "values[t] belongs to the state that rewards[t] led to: it is what bootstraps step t. Here values[t + 1] does.",
+        ),
+        Misconception(
+            "last-value-forgotten",
+            _dreamer(_backwards(_right, last=lambda v: torch.zeros_like(v[-1]))),
+            "Behind the horizon stands nothing here: the last return bootstraps from values[-1] alone, with no 1 - λ before it.",
+        ),
+        Misconception(
+            "no-bootstrap-at-the-end",
+            _dreamer(
+                lambda r, v, c, gamma, lam: (
+                    torch.cat([_backwards(_right)(r[:-1], v[:-1], c[:-1], gamma, lam), r[-1:]]) if len(r) > 1 else r.clone()
+                )
+            ),
+            "The last return is its reward only: it bootstraps from values[-1], and the returns before it go on from there.",
+        ),
+        Misconception(
+            "lam-swapped",
+            _dreamer(_backwards(lambda r, v, c, f, gamma, lam: _right(r, v, c, f, gamma, 1 - lam))),
+            "λ weights the longer return and 1 - λ the value: here it is the other way round.",
+        ),
+        Misconception(
+            "end-ignored",
+            _dreamer(_backwards(lambda r, v, c, f, gamma, lam: _right(r, v, 1.0, f, gamma, lam))),
+            "continues is not used: where a trajectory has ended nothing follows.",
+        ),
+        Misconception(
+            "end-stops-the-recursion-only",
+            _dreamer(_backwards(lambda r, v, c, f, gamma, lam: r + gamma * ((1 - lam) * v + lam * c * f))),
+            "After an end the value is still bootstrapped: continues multiplies both, the value and the return that follows.",
+        ),
+        Misconception(
+            "end-stops-the-value-only",
+            _dreamer(_backwards(lambda r, v, c, f, gamma, lam: r + gamma * ((1 - lam) * c * v + lam * f))),
+            "After an end the following returns still count: continues multiplies both, the value and the return that follows.",
+        ),
+        Misconception(
+            "end-of-the-next-step",
+            _dreamer(
+                lambda r, v, c, gamma, lam: _backwards(_right)(r, v, torch.cat([c[1:], torch.ones_like(c[:1])]), gamma, lam)
+            ),
+            "continues[t] belongs to step t: here that of step t + 1 is used.",
+        ),
+        Misconception(
+            "end-taken-as-flag",
+            _dreamer(lambda r, v, c, gamma, lam: _backwards(_right)(r, v, (c > 0.5).to(r.dtype), gamma, lam)),
+            "continues may be a probability: multiply by it, do not round it.",
+        ),
+        Misconception(
+            "gamma-missing",
+            _dreamer(_backwards(lambda r, v, c, f, gamma, lam: _right(r, v, c, f, 1.0, lam))),
+            "What follows is not discounted: multiply it by gamma.",
+        ),
+        Misconception(
+            "gamma-on-the-return-only",
+            _dreamer(_backwards(lambda r, v, c, f, gamma, lam: r + c * ((1 - lam) * v + gamma * lam * f))),
+            "gamma multiplies both: the value is one step away, too.",
+        ),
+        Misconception(
+            "weights-do-not-sum-to-one",
+            _dreamer(_backwards(lambda r, v, c, f, gamma, lam: r + gamma * c * (v + lam * f))),
+            "The value has the weight 1 - λ: with 1 what follows is counted 1 + λ times.",
+        ),
+        Misconception(
+            "lam-missing",
+            _dreamer(_backwards(lambda r, v, c, f, gamma, lam: _right(r, v, c, f, gamma, 1.0))),
+            "lam is not used: these are the sums of all rewards.",
+        ),
+        Misconception(
+            "one-step-only",
+            _dreamer(lambda r, v, c, gamma, lam: r + gamma * c * v),
+            "lam is not used: these are one-step targets.",
+        ),
+        Misconception(
+            "advantages",
+            _dreamer(lambda r, v, c, gamma, lam: _backwards(_right)(r, v, c, gamma, lam) - v),
+            "values are subtracted: the returns themselves are asked for.",
+        ),
+        Misconception(
+            "forwards",
+            _dreamer(_forwards),
+            "Time runs the wrong way: a return depends on what comes after, so begin with the last step.",
+        ),
+        Misconception(
+            "order-reversed",
+            _dreamer(lambda r, v, c, gamma, lam: _backwards(_right)(r, v, c, gamma, lam).flip(0)),
+            "The returns come in the order in which they were computed, last step first: turn them round.",
+        ),
+        Misconception(
+            "values-detached",
+            _dreamer(lambda r, v, c, gamma, lam: _backwards(_right)(r, v.detach(), c, gamma, lam)),
+            "No gradient reaches values: Dreamer's policy learns through them what lies behind the horizon.",
+        ),
+        Misconception("cut-from-graph", after(ch51.dreamer_lambda_returns, torch.Tensor.detach), CUT),
+        dtype_lost(ch51.dreamer_lambda_returns),
+        in_place(ch51.dreamer_lambda_returns, "values", 1),
+        Misconception("bad-input-accepted", _dreamer(_backwards(_right), checked=False), SHAPES),
+    ),
+    variants={
+        "sum of n-step returns": _dreamer(_as_sum),
+        "recursion by indices": _dreamer(_backwards(_right)),
+        "corrections on one-step targets": _dreamer(_from_deltas),
+        "linear system": _dreamer(_by_matrix),
+        "difference form": _dreamer(_backwards(lambda r, v, c, f, gamma, lam: r + gamma * c * (v + lam * (f - v)))),
+    },
+)
+
+# ---------------------------------------------------------------------------------------------------- model_error_by_horizon
+
+
+def _trajectories(steps=5, batch=6, obs_dim=3, action_dim=2, noise=0.0):
+    """Real trajectories that a model does not quite know."""
+
+    def inputs(generator):
+        model, _ = _world(generator, obs_dim, action_dim, noise, math.inf)
+        return {
+            "model": model,
+            "obs": normal(generator, steps + 1, batch, obs_dim) * torch.linspace(0.5, 2.0, obs_dim, dtype=torch.float64),
+            "actions": normal(generator, steps, batch, action_dim),
+            "generator": built("seeding.generator", seed=int(1e6 * uniform(generator, 1))),
+        }
+
+    return inputs
+
+
+def _perfect(generator):
+    """Trajectories that the model made itself."""
+    drawn = _trajectories()(generator)
+    parts = drawn["model"]["arguments"]
+    obs = [drawn["obs"][0]]
+    for taken in drawn["actions"]:
+        obs.append(obs[-1] @ parts["dynamics"] + taken @ parts["control"])
+    return drawn | {"obs": torch.stack(obs)}
+
+
+def _error(measure, predict=lambda model, predicted, real, taken, generator: model(predicted, taken, generator)[0], checked=True):
+    """A version: `measure` takes predictions and truth, (H, B, O) each."""
+
+    def version(model, obs, actions, generator):
+        if checked and (obs.shape[0] - 1, obs.shape[1]) != (actions.shape[0], actions.shape[1]):
+            raise ValueError(f"obs is (H + 1, B, O) and actions (H, B, A): {tuple(obs.shape)} and {tuple(actions.shape)}")
+        latest, predictions = obs[0], []
+        for t in range(len(actions)):
+            latest = predict(model, latest, obs[t], actions[t], generator)
+            predictions.append(latest)
+        return measure(torch.stack(predictions), obs[1 : len(actions) + 1])
+
+    return version
+
+
+def _root_mean_square(predictions, real):
+    return (predictions - real).square().mean((1, 2)).sqrt()
+
+
+def _against_the_step_before(predictions, real):
+    return _root_mean_square(predictions[1:], real[:-1])
+
+
+def _numpy_errors(predictions, real):
+    differences = (predictions - real).numpy().reshape(len(real), -1)
+    return torch.from_numpy(np.linalg.norm(differences, axis=1) / math.sqrt(differences.shape[1])).to(real.dtype)
+
+
+def _other_order(model, obs, actions, generator):
+    """Predictions first, into one tensor, then all errors."""
+    if len(obs) - len(actions) != 1 or obs.shape[1] != actions.shape[1]:
+        raise ValueError(f"{len(obs)} obs for {len(actions)} actions")
+    predictions = [obs[0]]
+    with torch.no_grad():
+        for taken in actions.unbind(0):
+            predictions.append(model(predictions[-1], taken, generator)[0])
+    gaps = torch.stack(predictions)[1:] - obs[1:]
+    return (gaps**2).flatten(1).sum(1).div(gaps[0].numel()).pow(0.5)
+
+
+MODEL_ERROR_BY_HORIZON = Exercise(
+    name="model_error_by_horizon",
+    reference=ch51.model_error_by_horizon,
+    criteria={"values": 1.2, "dtype": 0.1, "inputs": 0.1, "errors": 0.1},
+    axes=("h",),
+    cases=drawn_once(
+        Case("five steps", _trajectories(), visible=True, draws=2),
+        Case("a noisy model", _trajectories(noise=0.5), visible=True),
+        Case(
+            "a perfect model",
+            _perfect,
+            closed_form=lambda actions, **_rest: torch.zeros(len(actions), dtype=actions.dtype),
+            visible=True,
+        ),
+        Case("one step", _trajectories(1), visible=True),
+        Case("a single trajectory", _trajectories(batch=1)),
+        Case("as many trajectories as steps", _trajectories(4, 4, 4)),
+        Case("calls of the model", _trajectories(), returns=("model",)),
+        Case("single precision", _trajectories(), dtype=torch.float32, visible=True),
+        Case(
+            "as many obs as actions",
+            reshaped(_trajectories(), "obs", lambda x: x[:-1]),
+            raises=("obs", "actions"),
+            visible=True,
+        ),
+        Case("obs of one trajectory", reshaped(_trajectories(), "obs", lambda x: x[:, :1]), raises=("obs", "actions")),
+    ),
+    misconceptions=(
+        Misconception(
+            "one-step-predictions",
+            _error(_root_mean_square, lambda model, predicted, real, taken, generator: model(real, taken, generator)[0]),
+            "Each prediction starts from the real observation, so errors never add up: go on from what the model predicted.",
+        ),
+        Misconception(
+            "mean-square",
+            _error(lambda p, real: (p - real).square().mean((1, 2))),
+            "This is the mean square error: take its root, which is in units of the observations.",
+        ),
+        Misconception(
+            "mean-of-distances",
+            _error(lambda p, real: (p - real).square().sum(-1).sqrt().mean(1)),
+            "This is the mean Euclidean distance: the mean over samples and components comes before the root.",
+        ),
+        Misconception(
+            "mean-of-roots",
+            _error(lambda p, real: (p - real).square().mean(-1).sqrt().mean(1)),
+            "The root is taken for each sample: the mean over samples and components comes before the root.",
+        ),
+        Misconception(
+            "absolute-error",
+            _error(lambda p, real: (p - real).abs().mean((1, 2))),
+            "This is the mean absolute error: the root mean square is asked for.",
+        ),
+        Misconception(
+            "summed-over-components",
+            _error(lambda p, real: (p - real).square().sum(-1).mean(1).sqrt()),
+            "The squares are summed over the components: take their mean.",
+        ),
+        Misconception(
+            "error-of-the-mean",
+            _error(lambda p, real: (p - real).mean(1).square().mean(-1).sqrt()),
+            "Errors of opposite sign cancel: square before averaging over samples.",
+        ),
+        Misconception(
+            "per-component",
+            _error(lambda p, real: (p - real).square().mean(1).sqrt()),
+            "One number for each horizon is asked for: take the mean over components, too.",
+        ),
+        Misconception(
+            "accumulated",
+            _error(lambda p, real: _root_mean_square(p, real).cumsum(0)),
+            "The errors of all horizons so far are added up: each horizon has its own.",
+        ),
+        Misconception(
+            "averaged-over-horizons",
+            _error(lambda p, real: _root_mean_square(p, real).mean()),
+            "One number for each horizon is asked for: how the error grows is the point.",
+        ),
+        Misconception(
+            "start-included",
+            _error(lambda p, real: torch.cat([torch.zeros_like(p[:1, 0, 0]), _root_mean_square(p, real)])),
+            "The horizon begins at 1: the error at the start, 0, is left out.",
+        ),
+        Misconception(
+            "first-action-repeated",
+            lambda model, obs, actions, generator: ch51.model_error_by_horizon(
+                model, obs, actions[:1].expand_as(actions) if len(obs) == len(actions) + 1 else actions, generator
+            ),
+            "The first action is used at every step: step h takes actions[h].",
+        ),
+        Misconception(
+            "dtype-lost",
+            after(ch51.model_error_by_horizon, torch.Tensor.float),
+            "The result has lost the dtype of obs.",
+        ),
+        in_place(ch51.model_error_by_horizon, "obs", 1),
+        Misconception("bad-input-accepted", _error(_root_mean_square, checked=False), SHAPES),
+    ),
+    variants={
+        "all predictions first": _other_order,
+        "by indices": _error(_root_mean_square),
+        "NumPy": _error(_numpy_errors),
+        "vector norm": _error(
+            lambda p, real: torch.linalg.vector_norm(p - real, dim=(1, 2)) / math.sqrt(p.shape[1] * p.shape[2])
+        ),
+        "mean squared error, step by step": _error(
+            lambda p, real: torch.stack([functional.mse_loss(a, b).sqrt() for a, b in zip(p, real, strict=True)])
+        ),
+    },
+)
+
+EXERCISES = (GAUSSIAN_NLL, IMAGINE, DREAMER_LAMBDA_RETURNS, MODEL_ERROR_BY_HORIZON)
