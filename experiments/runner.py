@@ -43,7 +43,7 @@ from course_lib import records
 
 FOLDER = Path(__file__).parent
 RUNS = FOLDER / "runs"
-NOT_EXPERIMENTS = {"__init__", "runner", "checkpoint"}
+NOT_EXPERIMENTS = {"__init__", "runner", "checkpoint", "snapshots"}
 PACKAGES = ("torch", "numpy", "gymnasium", "Box2D", "mujoco", "transformers")  # what decides results, where installed
 LOCK, CLOCK = ".lock", ".seconds"
 
