@@ -115,18 +115,19 @@ class Agent:
 
     def state_dict(self):
         """All that `load_state_dict` needs to go on from here."""
-        tensors = [tensor.detach().clone() for tensor in self._tensors()]
+        tensors = [tensor.detach().clone() for tensor in self.tensors()]
         return {"tensors": tensors, "optimizers": [optimizer.state_dict() for optimizer in self._optimizers()]}
 
     @torch.no_grad()
     def load_state_dict(self, state):
         """Go on from `state_dict()`."""
-        for tensor, saved in zip(self._tensors(), state["tensors"], strict=True):
+        for tensor, saved in zip(self.tensors(), state["tensors"], strict=True):
             tensor.copy_(saved)
         for optimizer, saved in zip(self._optimizers(), state["optimizers"], strict=True):
             optimizer.load_state_dict(saved)
 
-    def _tensors(self):
+    def tensors(self):
+        """What is learnt: the weights of actor, critics and targets, and log_alpha."""
         return self.actor.weights, self.critics.weights, self.targets.weights, self.log_alpha
 
     def _optimizers(self):
