@@ -24,21 +24,21 @@ from solutions.ch96 import last_token_scores, reward_model_loss
 from solutions.ch97 import dpo_loss, ipo_loss, sequence_logps
 
 BETAS = (0.02, 0.05, 0.1, 0.3, 1.0)
-COMMON = {"model": "tiny", "pairs": 800, "batch": 16, "learning_rate": 1.5e-4, "loss": "dpo", "beta": 0.1}
+COMMON = {"model": "tiny", "pairs": 640, "batch": 16, "learning_rate": 2e-4, "loss": "dpo", "beta": 0.1}
 VARIANTS: dict[str, dict] = {
     **{f"dpo_{beta:g}": COMMON | {"beta": beta} for beta in BETAS},
+    "dpo_0.1": COMMON | {"look": 10},
     "smoothed": COMMON | {"label_smoothing": 0.2},
     "ipo": COMMON | {"loss": "ipo"},
-    "unfrozen": COMMON | {"loss": "unfrozen"},
-    "suspect": COMMON | {"padding_counts": True},
+    "unfrozen": COMMON | {"loss": "unfrozen", "look": 10},
+    "suspect": COMMON | {"padding_counts": True, "look": 10},
     "reward_model": COMMON | {"loss": "reward model", "learning_rate": 3e-4, "head_learning_rate": 5e-3},
 }
 SEEDS = 5
 ROWS = 5  # steps that a row stands for
-LOOK = 25  # steps between two looks at the policy's texts
-FEW, MANY = 64, 256  # texts looked at on the way and at the end
+FEW, MANY = 64, 192  # texts looked at on the way and at the end
 HELD_OUT = 64  # pairs of unseen texts, ordered by raters, that a program would log its accuracy on
-RATED = 400  # unseen texts with their mean ratings
+RATED = 300  # unseen texts with their mean ratings
 TAUGHT = Taught.of(vars(ch95), vars(ch45))
 
 
@@ -75,11 +75,37 @@ def human_pairs(model: lm.LanguageModel, count: int, seed: int, split: str = "re
 
 
 @functools.cache
+def reference(name: str) -> lm.LanguageModel:
+    return lm.load(name).frozen_copy()
+
+
+@functools.cache
+def prepared(name: str, count: int, size: int, seed: int, padding_counts: bool) -> tuple[list[Pairs], list[torch.Tensor], float]:
+    """One epoch of a seed, the reference's log-probabilities of it, and the processor time that took: once for all variants."""
+    begun = time.process_time()
+    epoch = batches(human_pairs(reference(name), count, seed), size, padding_counts, torch.Generator().manual_seed(seed))
+    return epoch, answered(reference(name), epoch), time.process_time() - begun
+
+
+@functools.cache
+def held_out(name: str, seed: int, padding_counts: bool) -> tuple[list[Pairs], torch.Tensor]:
+    """Pairs of unseen texts as a program would prepare them for its log, and the reference's log-probabilities (HELD_OUT, 2)."""
+    parts = batches(human_pairs(reference(name), HELD_OUT, 1000 + seed, "test"), 16, padding_counts)
+    return parts, torch.cat(answered(reference(name), parts))
+
+
+@functools.cache
 def rated(name: str) -> tuple[Pairs, torch.Tensor, torch.Tensor]:
-    """RATED unseen texts, two by two, their mean ratings (RATED,), and what the reference says of them (RATED / 2, 2): once a process."""
-    snippets, model = preferences.load("test"), lm.load(name)
+    """RATED unseen texts, two by two, their mean ratings (RATED,), and what the reference says of them (RATED / 2, 2)."""
+    snippets, model = preferences.load("test"), reference(name)
     pairs = encode_pairs(model, snippets.texts[:RATED:2], snippets.texts[1:RATED:2])
     return pairs, snippets.means[:RATED], reference_logps(model, pairs, sequence_logps)
+
+
+@torch.no_grad()
+def answered(model: lm.LanguageModel, parts: list[Pairs]) -> list[torch.Tensor]:
+    """log π of both texts of each pair, (B, 2) for each batch."""
+    return [completion_logps(model, part, sequence_logps) for part in parts]
 
 
 def accuracy(name: str, scores: torch.Tensor) -> float:
@@ -92,49 +118,49 @@ def gold(samples: lm.Samples) -> torch.Tensor:
     return gold_judge()(samples.texts)
 
 
+def written(policy: lm.LanguageModel, name: str, seed: int, texts: int) -> Writing:
+    """What the policy adds to prompts that it has not seen."""
+    generator = torch.Generator().manual_seed(10_000 + seed)
+    return Writer(policy, reference(name), gold, TAUGHT).write(openings("test")[:texts], 20, generator)
+
+
+@functools.cache
+def score_before(name: str, seed: int) -> float:
+    return written(reference(name), name, seed, MANY).scores.mean().item()
+
+
 def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result:
-    """Train on one epoch of pairs, looking at the policy's texts now and then; judge it at the end."""
+    """Train on one epoch of pairs, in some variants with a look at the policy's texts now and then; judge it at the end."""
     choice: dict[str, Any] = VARIANTS[variant]
     if choice["loss"] == "reward model":
         return reward_model(choice, seed, report)
     name, padding_counts = choice["model"], choice.get("padding_counts", False)
     loss = LOSSES[choice["loss"]](**{key: choice[key] for key in ("beta", "label_smoothing") if key in choice})
     policy = lm.load(name)
-    writer = Writer(policy, policy.frozen_copy(), gold, TAUGHT)
-    held_out = batches(human_pairs(policy, HELD_OUT, 1000 + seed, "test"), 16, padding_counts)
-
-    @torch.no_grad()
-    def asked(model: lm.LanguageModel, parts: list[Pairs]) -> list[torch.Tensor]:
-        return [completion_logps(model, part, sequence_logps) for part in parts]
-
-    def written(texts: int) -> Writing:
-        return writer.write(openings("test")[:texts], 20, torch.Generator().manual_seed(10_000 + seed))
+    epoch, ref, seconds = prepared(name, choice["pairs"], choice["batch"], seed, padding_counts)
+    unseen, unseen_ref = held_out(name, seed, padding_counts)
+    optimizer = torch.optim.AdamW(policy.parameters(), lr=choice["learning_rate"], weight_decay=0.0, fused=True)
 
     def look() -> dict[str, float]:
-        ratios = torch.cat(asked(policy, held_out)) - held_out_ref
-        return written(FEW).measured(TAUGHT) | {"held_out": (ratios[:, 0] > ratios[:, 1]).float().mean().item()}
+        moved = torch.cat(answered(policy, unseen)) - unseen_ref
+        return written(policy, name, seed, FEW).measured(TAUGHT) | {"held_out": (moved[:, 0] > moved[:, 1]).float().mean().item()}
 
-    held_out_ref = torch.cat(asked(writer.reference, held_out))
-    rows, steps = [{"step": 0} | look()], []
-    begun = time.process_time()
-    generator = torch.Generator().manual_seed(seed)
-    epoch = batches(human_pairs(policy, choice["pairs"], seed), choice["batch"], padding_counts, generator)
-    prepared = asked(writer.reference, epoch)
-    optimizer = torch.optim.AdamW(policy.parameters(), lr=choice["learning_rate"], weight_decay=0.0, fused=True)
-    seconds = time.process_time() - begun
-    for done, (part, ref_logps) in enumerate(zip(epoch, prepared, strict=True), 1):
+    rows: list[dict] = []
+    steps: list[dict] = []
+    for done, (part, ref_logps) in enumerate(zip(epoch, ref, strict=True), 1):
         begun = time.process_time()
         steps.append(train_step(policy, optimizer, part, ref_logps, loss, sequence_logps))
         seconds += time.process_time() - begun
         if done % ROWS == 0:
             row = {column: float(np.mean([step[column] for step in steps[-ROWS:]])) for column in steps[0]} | {"step": done}
-            rows.append(row | (look() if done % LOOK == 0 else {}))
+            rows.append(row | (look() if "look" in choice and done % choice["look"] == 0 else {}))
             report(done, len(epoch))
-    writing = written(MANY)
+    writing = written(policy, name, seed, MANY)
     pairs, _, ref_logps = rated(name)
     moved = reference_logps(policy, pairs, sequence_logps) - ref_logps
     summary: dict[str, Any] = writing.measured(TAUGHT) | {
         "gold": writing.scores.mean().item(),
+        "gold_before": score_before(name, seed),
         "vader": preferences.vader(writing.texts).mean().item(),
         "seconds": seconds,
         "rated_accuracy": accuracy(name, moved),
