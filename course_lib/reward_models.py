@@ -58,10 +58,10 @@ def fit(
     loss: Loss,
     last_token_scores: LastTokenScores,
     seed: int,
-    steps: int = 600,
+    steps: int = 300,
     batch: int = 64,
-    learning_rate: float = 5e-3,
-    weight_decay: float = 0.3,
+    learning_rate: float = 2e-3,
+    weight_decay: float = 3.0,
 ) -> RewardModel:
     """Minimise `loss` of chosen and rejected scores over minibatches of comparisons, with a learning rate that falls to 0.
 
