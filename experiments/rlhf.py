@@ -1,8 +1,8 @@
 """The whole of RLHF on text, small: supervised fine-tuning, a reward model from comparisons, PPO and best-of-n on it (chapter 96).
 
-Proxy and gold: the reward model that PPO maximises, in standard deviations of its scores of the fine-tuned policy's texts, and the judge
-that is held out, in units of the ratings. Prompts of the evaluation are of the split "test". A run's seed is that of everything: of fine-tuning,
-of the comparisons and the raters' answers, of the reward model and of PPO.
+Proxy and gold: the reward model that PPO maximises, in standard deviations of its scores of the fine-tuned policy's texts, and the
+judge that is held out, in units of the ratings. Prompts of the evaluation are of the split "test". A run's seed is that of everything:
+of fine-tuning, of the comparisons and the raters' answers, of the reward model and of PPO.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def _sft(variant: str, seed: int, report: Report) -> Result:
     begun = time.process_time()
     policy, losses = fine_tuned(seed)
     seconds = time.process_time() - begun
-    summary = {"cpu_seconds": seconds}
+    summary: dict[str, Any] = {"cpu_seconds": seconds}
     with torch.no_grad():
         for name, model in (("before", lm.load("tiny")), ("after", policy)):
             measured, texts = evaluation(model, seed)
