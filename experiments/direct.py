@@ -1,6 +1,7 @@
 """DPO on human ratings with the tiny language model: weights beta, other losses, an unfrozen reference, a silent bug (chapter 97).
 
-Every variant learns from the same pairs of film-review snippets, in one epoch. A row stands for five steps; in some of them texts of the
+Every variant begins with the fine-tuned policy of the experiment rlhf and learns from some of the comparisons that the reward model there
+has, in one epoch; a run's seed is that of both. A row stands for five steps; in some of them texts of the
 policy as it is then are looked at. At the end it is judged on prompts and on rated texts that it has not seen.
 """
 
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +18,17 @@ import torch
 
 from course_lib import lm, preferences
 from course_lib.direct import Pairs, completion_logps, encode_pairs, like_lengths, reference_logps, train_step
-from course_lib.fine_tuning import Taught, Writer, Writing, openings
+from course_lib.fine_tuning import Writer, Writing, openings
 from course_lib.judges import gold_judge
+from course_lib.reward_models import RewardModel, fit
+from course_lib.rlhf import whole_texts
+from experiments import rlhf
 from experiments.runner import Report, Result
-from solutions import ch45, ch95
 from solutions.ch96 import last_token_scores, reward_model_loss
 from solutions.ch97 import dpo_loss, ipo_loss, sequence_logps
 
 BETAS = (0.02, 0.05, 0.1, 0.3, 1.0)
-COMMON = {"model": "tiny", "pairs": 640, "batch": 16, "learning_rate": 2e-4, "loss": "dpo", "beta": 0.1}
+COMMON = {"pairs": 640, "batch": 16, "learning_rate": 2e-4, "loss": "dpo", "beta": 0.1}
 VARIANTS: dict[str, dict] = {
     **{f"dpo_{beta:g}": COMMON | {"beta": beta} for beta in BETAS},
     "dpo_0.1": COMMON | {"look": 10},
@@ -32,14 +36,13 @@ VARIANTS: dict[str, dict] = {
     "ipo": COMMON | {"loss": "ipo"},
     "unfrozen": COMMON | {"loss": "unfrozen", "look": 10},
     "suspect": COMMON | {"padding_counts": True, "look": 10},
-    "reward_model": COMMON | {"loss": "reward model", "learning_rate": 3e-4, "head_learning_rate": 5e-3},
+    "reward_model": COMMON | {"loss": "reward model"},
 }
 SEEDS = 5
 ROWS = 5  # steps that a row stands for
 FEW, MANY = 64, 192  # texts looked at on the way and at the end
 HELD_OUT = 64  # pairs of unseen texts, ordered by raters, that a program would log its accuracy on
 RATED = 300  # unseen texts with their mean ratings
-TAUGHT = Taught.of(vars(ch95), vars(ch45))
 
 
 def dpo(beta: float, label_smoothing: float = 0.0):
@@ -69,37 +72,44 @@ def batches(pairs: Pairs, size: int, padding_counts: bool, generator: torch.Gene
     ]
 
 
-def human_pairs(model: lm.LanguageModel, count: int, seed: int, split: str = "reward_model") -> Pairs:
-    asked = preferences.comparisons(count, seed, split)
+def reference(seed: int) -> lm.LanguageModel:
+    return rlhf.fine_tuned(seed)[0]
+
+
+def comparisons(count: int, seed: int) -> preferences.Preferences:
+    """The first of those that chapter 96's reward model of this seed is trained on."""
+    everything = preferences.comparisons(rlhf.COMPARISONS, seed)
+    names = ("chosen", "rejected", "disagreement", "gap")
+    return replace(everything, **{name: getattr(everything, name)[:count] for name in names})
+
+
+def encoded(model: lm.LanguageModel, asked: preferences.Preferences) -> Pairs:
     return encode_pairs(model, asked.chosen_texts, asked.rejected_texts)
 
 
 @functools.cache
-def reference(name: str) -> lm.LanguageModel:
-    return lm.load(name).frozen_copy()
-
-
-@functools.cache
-def prepared(name: str, count: int, size: int, seed: int, padding_counts: bool) -> tuple[list[Pairs], list[torch.Tensor], float]:
+def prepared(count: int, size: int, seed: int, padding_counts: bool) -> tuple[list[Pairs], list[torch.Tensor], float]:
     """One epoch of a seed, the reference's log-probabilities of it, and the processor time that took: once for all variants."""
+    model = reference(seed)
     begun = time.process_time()
-    epoch = batches(human_pairs(reference(name), count, seed), size, padding_counts, torch.Generator().manual_seed(seed))
-    return epoch, answered(reference(name), epoch), time.process_time() - begun
+    epoch = batches(encoded(model, comparisons(count, seed)), size, padding_counts, torch.Generator().manual_seed(seed))
+    return epoch, answered(model, epoch), time.process_time() - begun
 
 
 @functools.cache
-def held_out(name: str, seed: int, padding_counts: bool) -> tuple[list[Pairs], torch.Tensor]:
+def held_out(seed: int, padding_counts: bool) -> tuple[list[Pairs], torch.Tensor]:
     """Pairs of unseen texts as a program would prepare them for its log, and the reference's log-probabilities (HELD_OUT, 2)."""
-    parts = batches(human_pairs(reference(name), HELD_OUT, 1000 + seed, "test"), 16, padding_counts)
-    return parts, torch.cat(answered(reference(name), parts))
+    model = reference(seed)
+    parts = batches(encoded(model, preferences.comparisons(HELD_OUT, 1000 + seed, "test")), 16, padding_counts)
+    return parts, torch.cat(answered(model, parts))
 
 
 @functools.cache
-def rated(name: str) -> tuple[Pairs, torch.Tensor, torch.Tensor]:
-    """RATED unseen texts, two by two, their mean ratings (RATED,), and what the reference says of them (RATED / 2, 2)."""
-    snippets, model = preferences.load("test"), reference(name)
+def rated(seed: int) -> tuple[Pairs, torch.Tensor]:
+    """RATED unseen texts, two by two, and what the reference says of them (RATED / 2, 2)."""
+    snippets, model = preferences.load("test"), reference(seed)
     pairs = encode_pairs(model, snippets.texts[:RATED:2], snippets.texts[1:RATED:2])
-    return pairs, snippets.means[:RATED], reference_logps(model, pairs, sequence_logps)
+    return pairs, reference_logps(model, pairs, sequence_logps)
 
 
 @torch.no_grad()
@@ -108,25 +118,20 @@ def answered(model: lm.LanguageModel, parts: list[Pairs]) -> list[torch.Tensor]:
     return [completion_logps(model, part, sequence_logps) for part in parts]
 
 
-def accuracy(name: str, scores: torch.Tensor) -> float:
-    """How often scores, (RATED / 2, 2), put two of the rated texts in the order of their mean ratings, over all pairs of them."""
-    return preferences.pairwise_accuracy(scores.flatten(), rated(name)[1]).estimate
+def accuracy(scores: torch.Tensor) -> float:
+    """How often scores (RATED,) put two of the rated texts in the order of their mean ratings, over all pairs of them."""
+    return preferences.pairwise_accuracy(scores, preferences.load("test").means[:RATED]).estimate
 
 
-def gold(samples: lm.Samples) -> torch.Tensor:
-    """What the judge of chapter 96 gives for the completions."""
-    return gold_judge()(samples.texts)
-
-
-def written(policy: lm.LanguageModel, name: str, seed: int, texts: int) -> Writing:
-    """What the policy adds to prompts that it has not seen."""
-    generator = torch.Generator().manual_seed(10_000 + seed)
-    return Writer(policy, reference(name), gold, TAUGHT).write(openings("test")[:texts], 20, generator)
+def written(policy: lm.LanguageModel, seed: int, texts: int) -> Writing:
+    """What the policy adds to prompts that it has not seen, and what the judge of chapter 96 gives for the whole texts."""
+    writer = Writer(policy, reference(seed), lambda samples: gold_judge()(whole_texts(policy, samples)), rlhf.TAUGHT)
+    return writer.write(openings("test")[:texts], rlhf.PPO.new_tokens, torch.Generator().manual_seed(10_000 + seed))
 
 
 @functools.cache
-def score_before(name: str, seed: int) -> float:
-    return written(reference(name), name, seed, MANY).scores.mean().item()
+def score_before(seed: int) -> float:
+    return written(reference(seed), seed, MANY).scores.mean().item()
 
 
 def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result:
@@ -134,16 +139,16 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
     choice: dict[str, Any] = VARIANTS[variant]
     if choice["loss"] == "reward model":
         return reward_model(choice, seed, report)
-    name, padding_counts = choice["model"], choice.get("padding_counts", False)
+    padding_counts = choice.get("padding_counts", False)
     loss = LOSSES[choice["loss"]](**{key: choice[key] for key in ("beta", "label_smoothing") if key in choice})
-    policy = lm.load(name)
-    epoch, ref, seconds = prepared(name, choice["pairs"], choice["batch"], seed, padding_counts)
-    unseen, unseen_ref = held_out(name, seed, padding_counts)
+    policy = reference(seed).frozen_copy().requires_grad_(True)
+    epoch, ref, seconds = prepared(choice["pairs"], choice["batch"], seed, padding_counts)
+    unseen, unseen_ref = held_out(seed, padding_counts)
     optimizer = torch.optim.AdamW(policy.parameters(), lr=choice["learning_rate"], weight_decay=0.0, fused=True)
 
     def look() -> dict[str, float]:
         moved = torch.cat(answered(policy, unseen)) - unseen_ref
-        return written(policy, name, seed, FEW).measured(TAUGHT) | {"held_out": (moved[:, 0] > moved[:, 1]).float().mean().item()}
+        return written(policy, seed, FEW).measured(rlhf.TAUGHT) | {"held_out": (moved[:, 0] > moved[:, 1]).float().mean().item()}
 
     rows: list[dict] = []
     steps: list[dict] = []
@@ -155,15 +160,15 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
             row = {column: float(np.mean([step[column] for step in steps[-ROWS:]])) for column in steps[0]} | {"step": done}
             rows.append(row | (look() if "look" in choice and done % choice["look"] == 0 else {}))
             report(done, len(epoch))
-    writing = written(policy, name, seed, MANY)
-    pairs, _, ref_logps = rated(name)
+    writing = written(policy, seed, MANY)
+    pairs, ref_logps = rated(seed)
     moved = reference_logps(policy, pairs, sequence_logps) - ref_logps
-    summary: dict[str, Any] = writing.measured(TAUGHT) | {
+    summary: dict[str, Any] = writing.measured(rlhf.TAUGHT) | {
         "gold": writing.scores.mean().item(),
-        "gold_before": score_before(name, seed),
+        "gold_before": score_before(seed),
         "vader": preferences.vader(writing.texts).mean().item(),
         "seconds": seconds,
-        "rated_accuracy": accuracy(name, moved),
+        "rated_accuracy": accuracy(moved.flatten()),
         "unseen_moved": moved.mean().item(),
         **{column: float(np.mean([step[column] for step in steps[-2 * ROWS :]])) for column in steps[0]},
         "texts": [{"prompt": prompt, "text": text} for prompt, text in zip(openings("test"), writing.texts[:8], strict=False)],
@@ -172,32 +177,10 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
 
 
 def reward_model(choice: dict, seed: int, report: Report) -> Result:
-    """What chapter 96 does with the same pairs: a score at the end of each text, and the loss of Bradley and Terry."""
-    model = lm.ValueModel(lm.load(choice["model"]))
+    """Chapter 96's reward model, from the same comparisons as the other variants."""
     begun = time.process_time()
-    generator = torch.Generator().manual_seed(seed)
-    epoch = batches(human_pairs(model.body, choice["pairs"], seed), choice["batch"], False, generator)
-    parts = {"learning_rate": model.body, "head_learning_rate": model.head}
-    groups = [{"params": part.parameters(), "lr": choice[name]} for name, part in parts.items()]
-    optimizer = torch.optim.AdamW(groups, weight_decay=0.0, fused=True)
-
-    def scored(part: Pairs) -> torch.Tensor:
-        input_ids, attention_mask = (half.flatten(0, 1) for half in part[:2])
-        return last_token_scores(model(input_ids, attention_mask), attention_mask).unflatten(0, (-1, 2))
-
-    rows: list[dict] = []
-    for part in epoch:
-        loss = reward_model_loss(*scored(part).unbind(1))
-        optimizer.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-        optimizer.step()
-        rows.append({"step": len(rows), "loss": loss.item()})
-        report(len(rows), len(epoch))
-    seconds = time.process_time() - begun
-    pairs = rated(choice["model"])[0]
-    scores = torch.empty(len(pairs.input_ids), 2)
-    with torch.no_grad():
-        for some in like_lengths(pairs, 16):
-            scores[some] = scored(pairs.of(some))
-    return Result(rows, {"rated_accuracy": accuracy(choice["model"], scores), "seconds": seconds})
+    asked = comparisons(choice["pairs"], seed)
+    model = fit(RewardModel(lm.load("tiny"), seed=seed), asked, reward_model_loss, last_token_scores, seed)
+    row = {"seconds": time.process_time() - begun}
+    row["rated_accuracy"] = accuracy(model.scores(preferences.load("test").texts[:RATED], last_token_scores))
+    return Result([row], row)
