@@ -29,7 +29,7 @@ VARIANTS: dict[str, dict] = {
         "last_layers": 6, "kl_coef": 0.05, "iterations": 12, "batch": 16, "new_tokens": 16, "minibatch": 8, "learning_rate": 2e-4,
     },
     "dpo": {"last_layers": 6, "beta": 0.1, "steps": 20, "batch": 8, "learning_rate": 2e-4},
-    "reward_model": {"last_layers": 6, "steps": 40, "batch": 8, "learning_rate": 1e-4},
+    "reward_model": {"last_layers": 6, "steps": 48, "batch": 8, "learning_rate": 1e-4, "head_learning_rate": 5e-3},
 }  # fmt: skip
 SEEDS = 3
 WRITTEN, NEW_TOKENS = 24, 16  # texts looked at before and after, to prompts that training has not seen, and their length
@@ -138,7 +138,12 @@ def reward_model(model: lm.LanguageModel, layers: int, settings: dict, seed: int
     """Chapter 96: one number for each text, the higher the better people like it; from pairs that are each seen once."""
     judge = lm.ValueModel(model)
     train_last(judge.body, layers)
-    optimizer = optimizer_of(judge, settings["learning_rate"])
+    optimizer = optimizer_of(judge.body, settings["learning_rate"])
+    head = {
+        "params": judge.head.parameters(),
+        "lr": settings["head_learning_rate"],
+    }  # begins at 0, and what it reads differs little
+    optimizer.add_param_group(head)
     begun, rows = time.perf_counter(), []
     for pairs in batches(model, settings, seed):
         scores = scored(judge, pairs)
