@@ -189,8 +189,10 @@ def ours(model: lm.LanguageModel, pairs: Pairs, cached: bool):
         for step in range(WARM_UP + STEPS):
             if step == WARM_UP:
                 start = time.process_time()
-            ref_logps = known if cached else reference_logps(reference, pairs, sequence_logps)
-            train_step(policy, optimizer, pairs, ref_logps, loss, sequence_logps)
+            rows = torch.randperm(PAIRS)
+            batch = pairs.of(rows)
+            ref_logps = known[rows] if cached else reference_logps(reference, batch, sequence_logps)
+            train_step(policy, optimizer, batch, ref_logps, loss, sequence_logps)
         yield (time.process_time() - start) / STEPS
 
 
