@@ -69,21 +69,24 @@ def completion_logps(model: LanguageModel, pairs: Pairs, sequence_logps: Callabl
 
 def _hidden_of_rows(model: LanguageModel, pairs: Pairs) -> torch.Tensor:
     """What the last layer knows at each token of each text, (B, 2, L, D), from one row for each pair."""
-    columns = torch.arange(pairs.input_ids.shape[-1], device=model.device).expand(pairs.input_ids.shape)
-    chosen_tokens = pairs.completion_mask[:, 0].sum(-1)[:, None]
+    input_ids, attention_mask, completion_mask = pairs
+    columns = torch.arange(input_ids.shape[-1], device=model.device).expand(input_ids.shape)
+    chosen_tokens = completion_mask[:, 0].sum(-1)[:, None]
     places = columns.clone()  # of each token in its pair's row
-    places[:, 1] += torch.where(pairs.completion_mask[:, 1], chosen_tokens, 0)
-    width = int(places[pairs.attention_mask].max()) + 1
-    places = torch.where(pairs.attention_mask, places, width)  # padding goes to a column that is cut off
+    places[:, 1] += torch.where(completion_mask[:, 1], chosen_tokens, 0)
+    needed = attention_mask | completion_mask
+    width = int(places[needed].max()) + 1
+    places = torch.where(needed, places, width)  # padding goes to a column that is cut off
 
     def rows_of(values: torch.Tensor) -> torch.Tensor:
         rows = values.new_zeros(len(values), width + 1)
         return rows.scatter(1, places.flatten(1), values.flatten(1))[:, :width]
 
-    side = rows_of(pairs.completion_mask * torch.tensor([[1], [2]], device=model.device))  # 0 in the prompt
+    side = rows_of(completion_mask * torch.tensor([[1], [2]], device=model.device))  # 0 in the prompt
     seen = (side[:, None, :] == 0) | (side[:, None, :] == side[:, :, None])  # (B, asking, asked)
-    seen &= torch.ones(width, width, dtype=torch.bool, device=model.device).tril()
-    inputs = {"input_ids": rows_of(pairs.input_ids), "attention_mask": seen[:, None], "position_ids": rows_of(columns)}
+    seen &= rows_of(attention_mask)[:, None, :] & torch.ones(width, width, dtype=torch.bool, device=model.device).tril()
+    positions = rows_of((attention_mask.cumsum(-1) - 1).clamp(min=0))
+    inputs = {"input_ids": rows_of(input_ids), "attention_mask": seen[:, None], "position_ids": positions}
     hidden = model.network.base_model(**inputs).last_hidden_state
     return hidden[torch.arange(len(hidden), device=model.device)[:, None, None], places.clamp(max=width - 1)]
 

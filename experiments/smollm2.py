@@ -125,7 +125,8 @@ def dpo(policy: lm.LanguageModel, layers: int, settings: dict, seed: int, report
     optimizer = optimizer_of(policy, settings["learning_rate"])
     loss = functools.partial(dpo_loss, beta=settings["beta"])
     before = written(writer, seed)
-    begun, rows = time.perf_counter(), []
+    rows: list[dict[str, float]] = []
+    begun = time.perf_counter()
     for pairs in batches(policy, settings, seed):
         row = train_step(policy, optimizer, pairs, reference_logps(reference, pairs, sequence_logps), loss, sequence_logps)
         rows.append({"iteration": len(rows), **row, "seconds": time.perf_counter() - begun})
@@ -144,7 +145,8 @@ def reward_model(model: lm.LanguageModel, layers: int, settings: dict, seed: int
         "lr": settings["head_learning_rate"],
     }  # begins at 0, and what it reads differs little
     optimizer.add_param_group(head)
-    begun, rows = time.perf_counter(), []
+    rows: list[dict[str, float]] = []
+    begun = time.perf_counter()
     for pairs in batches(model, settings, seed):
         scores = scored(judge, pairs)
         loss = reward_model_loss(*scores.unbind(1))
