@@ -7,7 +7,8 @@
         row = train_step(policy, optimizer, pairs.of(rows), ref_logps[rows], dpo_loss, sequence_logps)
 
 What the chapter teaches, the log-probability of a completion and the loss, is handed in. What is saved is work that changes no number:
-one network call for both sides, no logits before the completions, little padding, and a reference that is asked once.
+a prompt is read once for both sides, no logits are computed before the completions, little is padding, and the reference
+is asked once.
 """
 
 from __future__ import annotations
@@ -57,13 +58,37 @@ def encode_pairs(model: LanguageModel, chosen: Sequence[str], rejected: Sequence
 def completion_logps(model: LanguageModel, pairs: Pairs, sequence_logps: Callable) -> torch.Tensor:
     """log π(y|x) of both completions of each pair; (B, 2), with a graph where one is kept.
 
-    Both sides go through the network at once, and the head, which is as wide as the vocabulary, is applied from the column before the
-    first completion on.
+    Each pair goes through the network as one row, prompt, chosen and rejected completion, in which no completion sees the other: so the
+    prompt is read once. The head, which is as wide as the vocabulary, is applied from the column before the first completion on.
     """
-    input_ids, attention_mask, completion_mask = (part.flatten(0, 1) for part in pairs)  # (2B, L)
+    input_ids, _, completion_mask = (part.flatten(0, 1) for part in pairs)  # (2B, L)
     start = int(completion_mask[:, 1:].any(0).nonzero()[0])
-    logits = model.head(model.hidden(input_ids, attention_mask)[:, start:])
-    return sequence_logps(logits, input_ids[:, start:], completion_mask[:, start:]).unflatten(0, (-1, 2))
+    hidden = _hidden_of_rows(model, pairs)[:, :, start:].flatten(0, 1)
+    return sequence_logps(model.head(hidden), input_ids[:, start:], completion_mask[:, start:]).unflatten(0, (-1, 2))
+
+
+def _hidden_of_rows(model: LanguageModel, pairs: Pairs) -> torch.Tensor:
+    """What the last layer knows at each token of each text, (B, 2, L, D), from one row for each pair."""
+    input_ids, attention_mask, completion_mask = pairs
+    columns = torch.arange(input_ids.shape[-1], device=model.device).expand(input_ids.shape)
+    chosen_tokens = completion_mask[:, 0].sum(-1)[:, None]
+    places = columns.clone()  # of each token in its pair's row
+    places[:, 1] += torch.where(completion_mask[:, 1], chosen_tokens, 0)
+    needed = attention_mask | completion_mask
+    width = int(places[needed].max()) + 1
+    places = torch.where(needed, places, width)  # padding goes to a column that is cut off
+
+    def rows_of(values: torch.Tensor) -> torch.Tensor:
+        rows = values.new_zeros(len(values), width + 1)
+        return rows.scatter(1, places.flatten(1), values.flatten(1))[:, :width]
+
+    side = rows_of(completion_mask * torch.tensor([[1], [2]], device=model.device))  # 0 in the prompt
+    seen = (side[:, None, :] == 0) | (side[:, None, :] == side[:, :, None])  # (B, asking, asked)
+    seen &= rows_of(attention_mask)[:, None, :] & torch.ones(width, width, dtype=torch.bool, device=model.device).tril()
+    positions = rows_of((attention_mask.cumsum(-1) - 1).clamp(min=0))
+    inputs = {"input_ids": rows_of(input_ids), "attention_mask": seen[:, None], "position_ids": positions}
+    hidden = model.network.base_model(**inputs).last_hidden_state
+    return hidden[torch.arange(len(hidden), device=model.device)[:, None, None], places.clamp(max=width - 1)]
 
 
 @torch.no_grad()

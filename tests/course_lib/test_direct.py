@@ -53,6 +53,15 @@ def test_log_probabilities_are_those_of_every_text_alone_with_all_logits(model, 
             torch.testing.assert_close(found[pair, side], alone[0], rtol=1e-5, atol=1e-4)
 
 
+def test_even_a_mask_that_counts_padding_gives_what_all_logits_would(model, pairs):
+    everything = torch.ones_like(pairs.completion_mask)
+    everything[..., 0] = False
+    wrong = pairs._replace(completion_mask=everything)
+    flat = [part.flatten(0, 1) for part in wrong]
+    expected = sequence_logps(model.logits(*flat[:2]), flat[0], flat[2]).unflatten(0, (-1, 2))
+    torch.testing.assert_close(completion_logps(model, wrong, sequence_logps), expected, rtol=1e-5, atol=1e-4)
+
+
 def test_the_reference_answers_in_the_order_of_the_pairs(model, pairs):
     expected = completion_logps(model, pairs, sequence_logps)
     torch.testing.assert_close(reference_logps(model, pairs, sequence_logps, batch=2), expected.detach(), rtol=1e-5, atol=1e-4)
