@@ -51,7 +51,10 @@ def dpo(beta: float, label_smoothing: float = 0.0):
 
 def ipo(beta: float):
     """ipo_loss with the implicit rewards that `train_step` logs."""
-    return lambda *logps: (ipo_loss(*logps, beta=beta), *dpo_loss(*logps, beta=beta)[1:])
+    return lambda chosen, rejected, ref_chosen, ref_rejected: (
+        ipo_loss(chosen, rejected, ref_chosen, ref_rejected, beta),
+        *dpo_loss(chosen, rejected, ref_chosen, ref_rejected, beta)[1:],
+    )
 
 
 def unfrozen(beta: float):
