@@ -34,7 +34,7 @@ VARIANTS: dict[str, dict] = {
     "dpo_0.1": COMMON | {"look": 10},
     "smoothed": COMMON | {"label_smoothing": 0.2},
     "ipo": COMMON | {"loss": "ipo"},
-    "unfrozen": COMMON | {"loss": "unfrozen", "look": 10},
+    "unfrozen": COMMON | {"loss": "unfrozen", "beta": 1.0},
     "suspect": COMMON | {"padding_counts": True, "look": 10},
     "reward_model": COMMON | {"loss": "reward model"},
 }
