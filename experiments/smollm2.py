@@ -1,14 +1,15 @@
 """The methods of chapters 95 to 97 on a real pretrained model, SmolLM2-135M: PPO with VADER's sentiment, a reward model, DPO.
 
-A few minutes of one core each: few and short texts, and only the network's last layers are trained, which saves half of the time. On a
-GPU every number below can be raised. Reading the records needs neither the model nor the package that holds it.
+A few minutes of one core each: few and short texts, and only the network's last layers are trained, which saves half of the time, or,
+for the reward model, no layer but a new head. On a GPU every number below can be raised. Reading the records needs neither the model
+nor the package that holds it.
 """
 
 from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from course_lib.fine_tuning import Taught, TokenPPO, Writer, Writing, openings, 
 from course_lib.seeding import seed_everything
 from experiments.runner import Report, Result
 from solutions import ch45, ch95
-from solutions.ch96 import last_token_scores, reward_model_loss
+from solutions.ch96 import reward_model_loss
 from solutions.ch97 import dpo_loss, sequence_logps
 
 MODEL = "smollm2-135m"
@@ -29,7 +30,7 @@ VARIANTS: dict[str, dict] = {
         "last_layers": 6, "kl_coef": 0.05, "iterations": 12, "batch": 16, "new_tokens": 16, "minibatch": 8, "learning_rate": 2e-4,
     },
     "dpo": {"last_layers": 6, "beta": 0.1, "steps": 20, "batch": 8, "learning_rate": 2e-4},
-    "reward_model": {"last_layers": 6, "steps": 48, "batch": 8, "learning_rate": 1e-4, "head_learning_rate": 5e-3},
+    "reward_model": {"last_layers": 0, "texts": 600, "steps": 150, "batch": 64, "learning_rate": 1e-3},
 }  # fmt: skip
 SEEDS = 3
 WRITTEN, NEW_TOKENS = 24, 16  # texts looked at before and after, to prompts that training has not seen, and their length
@@ -39,11 +40,9 @@ TAUGHT = Taught.of(vars(ch95), vars(ch45))
 
 
 def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result:
-    """Train the last layers, and say what that changed."""
-    settings: dict[str, Any] = dict(VARIANTS[variant])
-    layers = settings.pop("last_layers")
+    """Train, and say what that changed."""
     method = {"ppo": ppo, "dpo": dpo, "reward_model": reward_model}[variant]
-    return method(lm.load(MODEL), layers, settings, seed, report)
+    return method(lm.load(MODEL), dict(VARIANTS[variant]), seed, report)
 
 
 def train_last(model: lm.LanguageModel, layers: int) -> None:
@@ -52,20 +51,6 @@ def train_last(model: lm.LanguageModel, layers: int) -> None:
     model.requires_grad_(False)
     for part in (*body.layers[-layers:], body.norm):
         part.requires_grad_(True)
-
-
-def trained(model: torch.nn.Module) -> list[torch.nn.Parameter]:
-    return [parameter for parameter in model.parameters() if parameter.requires_grad]
-
-
-def optimizer_of(model: torch.nn.Module, learning_rate: float) -> torch.optim.Optimizer:
-    return torch.optim.AdamW(trained(model), lr=learning_rate, weight_decay=0.0, fused=True)
-
-
-def asked(split: str, pairs: int, seed: int) -> preferences.Preferences:
-    """Random pairs of a split's film reviews, each ordered by two people, one rater of either text."""
-    generator = torch.Generator().manual_seed(seed)
-    return preferences.ask_two_raters(preferences.draw_pairs(preferences.load(split), pairs, generator), generator)
 
 
 # ------------------------------------------------------------------------------------------------------ before and after
@@ -104,11 +89,11 @@ def order_found(scores: torch.Tensor) -> dict[str, float]:
 # ---------------------------------------------------------------------------------------------------------- the methods
 
 
-def ppo(policy: lm.LanguageModel, layers: int, settings: dict, seed: int, report: Report) -> Result:
+def ppo(policy: lm.LanguageModel, settings: dict, seed: int, report: Report) -> Result:
     """Chapter 95: make what the policy adds to the first words of a film review sound positive to VADER."""
-    choice = TokenPPO(**settings)
     writer = Writer(policy, policy.frozen_copy(), vader_scores, TAUGHT)
-    train_last(policy, layers)
+    train_last(policy, settings.pop("last_layers"))
+    choice = TokenPPO(**settings)
     before = written(writer, seed)
     rows = []
     for row in train(writer, openings("policy"), choice, seed):
@@ -117,12 +102,13 @@ def ppo(policy: lm.LanguageModel, layers: int, settings: dict, seed: int, report
     return Result(rows, compared(before, written(writer, seed)))
 
 
-def dpo(policy: lm.LanguageModel, layers: int, settings: dict, seed: int, report: Report) -> Result:
+def dpo(policy: lm.LanguageModel, settings: dict, seed: int, report: Report) -> Result:
     """Chapter 97: learn from people's order of pairs of film reviews, each seen once."""
     reference = policy.frozen_copy()
     writer = Writer(policy, reference, vader_scores, TAUGHT)
-    train_last(policy, layers)
-    optimizer = optimizer_of(policy, settings["learning_rate"])
+    train_last(policy, settings["last_layers"])
+    learning = [parameter for parameter in policy.parameters() if parameter.requires_grad]
+    optimizer = torch.optim.AdamW(learning, lr=settings["learning_rate"], weight_decay=0.0, fused=True)
     loss = functools.partial(dpo_loss, beta=settings["beta"])
     before = written(writer, seed)
     rows: list[dict[str, float]] = []
@@ -135,44 +121,57 @@ def dpo(policy: lm.LanguageModel, layers: int, settings: dict, seed: int, report
     return Result(rows, compared(before, written(writer, seed)) | order_found(now - then))
 
 
-def reward_model(model: lm.LanguageModel, layers: int, settings: dict, seed: int, report: Report) -> Result:
-    """Chapter 96: one number for each text, the higher the better people like it; from pairs that are each seen once."""
-    judge = lm.ValueModel(model)
-    train_last(judge.body, layers)
-    optimizer = optimizer_of(judge.body, settings["learning_rate"])
-    head = {
-        "params": judge.head.parameters(),
-        "lr": settings["head_learning_rate"],
-    }  # begins at 0, and what it reads differs little
-    optimizer.add_param_group(head)
+def reward_model(model: lm.LanguageModel, settings: dict, seed: int, report: Report) -> Result:
+    """Chapter 96: one number for each text, the higher the better people like it. The body stays as it is, and reads each text once."""
+    steps, batch, generator = settings["steps"], settings["batch"], seed_everything(seed)
+    snippets = some(preferences.load("reward_model"), settings["texts"], generator)
+    features, others = known(model, snippets.texts), known(model, preferences.load("test").texts[:RATED])
+    mean, std = features.mean(0), features.std(0)  # the text changes them little, beside what all texts share
+    features, others = (features - mean) / std, (others - mean) / std
+    said = asked(snippets, steps * batch, generator)
+    head = torch.nn.Linear(model.width, 1)
+    torch.nn.init.zeros_(head.weight)
+    optimizer = torch.optim.AdamW(head.parameters(), lr=settings["learning_rate"], weight_decay=0.0)
     rows: list[dict[str, float]] = []
-    begun = time.perf_counter()
-    for pairs in batches(model, settings, seed):
-        scores = scored(judge, pairs)
-        loss = reward_model_loss(*scores.unbind(1))
+    for step, pairs in enumerate(torch.arange(len(said)).split(batch)):
+        chosen, rejected = (head(features[texts[pairs]]).squeeze(1) for texts in (said.chosen, said.rejected))
+        loss = reward_model_loss(chosen, rejected)
+        if step % 10 == 0:
+            right = (chosen > rejected).float().mean().item()
+            held_out = order_found(head(others).detach())["accuracy"]
+            rows.append({"iteration": step, "loss": loss.item(), "accuracy": right, "held_out_accuracy": held_out})
         optimizer.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(trained(judge), 1.0)
         optimizer.step()
-        right = (scores[:, 0] > scores[:, 1]).float().mean().item()
-        rows.append({"iteration": len(rows), "loss": loss.item(), "accuracy": right, "seconds": time.perf_counter() - begun})
-        report(len(rows), settings["steps"])
-    texts = unseen(model)
-    scores = torch.empty(texts.input_ids.shape[:2])
-    with torch.no_grad():
-        for few in like_lengths(texts, 32):
-            scores[few] = scored(judge, texts.of(few))
-    return Result(rows, order_found(scores))
+        report(step + 1, steps)
+    return Result(rows, order_found(head(others).detach()))
+
+
+@torch.no_grad()
+def known(model: lm.LanguageModel, texts: Sequence[str]) -> torch.Tensor:
+    """What the last layer knows at the end token of each text; (N, D)."""
+    order = sorted(range(len(texts)), key=lambda index: len(texts[index]))
+    features = torch.empty(len(texts), model.width)
+    for few in torch.tensor(order).split(32):
+        tokens = model.encode([texts[index] for index in few.tolist()], ended=True)
+        features[few] = model.hidden(*tokens)[torch.arange(len(few)), tokens.attention_mask.sum(1) - 1]
+    return features
+
+
+def some(snippets: preferences.Snippets, count: int, generator: torch.Generator) -> preferences.Snippets:
+    """So many of the snippets, at random."""
+    picks = torch.randperm(len(snippets), generator=generator)[:count].tolist()
+    return preferences.Snippets(*([part[pick] for pick in picks] for part in (snippets.ids, snippets.texts, snippets.ratings)))
+
+
+def asked(snippets: preferences.Snippets, pairs: int, generator: torch.Generator) -> preferences.Preferences:
+    """Random pairs of snippets, each ordered by two people, one rater of either text."""
+    return preferences.ask_two_raters(preferences.draw_pairs(snippets, pairs, generator), generator)
 
 
 def batches(model: lm.LanguageModel, settings: dict, seed: int) -> Iterator[Pairs]:
     """One epoch of as many pairs as the steps need."""
-    said = asked("reward_model", settings["steps"] * settings["batch"], seed)
+    generator = torch.Generator().manual_seed(seed)
+    said = asked(preferences.load("reward_model"), settings["steps"] * settings["batch"], generator)
     pairs = encode_pairs(model, said.chosen_texts, said.rejected_texts)
     return (pairs.of(rows) for rows in like_lengths(pairs, settings["batch"], seed_everything(seed)))
-
-
-def scored(judge: lm.ValueModel, pairs: Pairs) -> torch.Tensor:
-    """Scores of both texts of each pair; (B, 2)."""
-    input_ids, attention_mask = pairs.input_ids.flatten(0, 1), pairs.attention_mask.flatten(0, 1)
-    return last_token_scores(judge(input_ids, attention_mask), attention_mask).unflatten(0, (-1, 2))

@@ -24,8 +24,13 @@ def loaded(little, monkeypatch):
     """What `run` gets to work on, with little to do."""
     model = copy.deepcopy(little)
     monkeypatch.setattr(lm, "load", lambda name: model)
-    for variant, few in {"ppo": {"iterations": 2, "batch": 4}, "dpo": {"steps": 2}, "reward_model": {"steps": 2}}.items():
-        monkeypatch.setitem(smollm2.VARIANTS, variant, smollm2.VARIANTS[variant] | few | {"last_layers": 1})
+    for variant, few in {
+        "ppo": {"iterations": 2, "batch": 4},
+        "dpo": {"steps": 2},
+        "reward_model": {"steps": 11, "texts": 20},
+    }.items():
+        layers = {"last_layers": min(1, smollm2.VARIANTS[variant]["last_layers"])}
+        monkeypatch.setitem(smollm2.VARIANTS, variant, smollm2.VARIANTS[variant] | few | layers)
     monkeypatch.setattr(smollm2, "WRITTEN", 4)
     monkeypatch.setattr(smollm2, "RATED", 8)
     return model
@@ -47,10 +52,11 @@ def test_a_reward_model_is_judged_on_unseen_texts_and_leaves_the_language_model_
     result = smollm2.run("reward_model", 0, tmp_path, lambda done, total: None)
     assert not changed(little, loaded)
     assert result.summary["accuracy_low"] <= result.summary["accuracy"] <= result.summary["accuracy_high"]
-    assert [row["iteration"] for row in result.rows] == [0, 1]
+    assert [row["iteration"] for row in result.rows] == [0, 10]
+    assert result.rows[0]["held_out_accuracy"] == 0.5 and result.rows[0]["loss"] == pytest.approx(0.693147, abs=1e-5)
 
 
-def test_pairs_are_the_same_for_a_seed_and_of_the_split_for_reward_models():
-    asked = smollm2.asked("reward_model", 20, seed=3)
-    assert torch.equal(asked.chosen, smollm2.asked("reward_model", 20, seed=3).chosen)
-    assert not torch.equal(asked.chosen, smollm2.asked("reward_model", 20, seed=4).chosen)
+def test_what_is_known_of_a_text_does_not_depend_on_the_texts_beside_it(little):
+    texts = ["A film", "It is a long and very fine film about a film", ""]
+    together = smollm2.known(little, texts)
+    torch.testing.assert_close(together, torch.cat([smollm2.known(little, [text]) for text in texts]), rtol=1e-4, atol=1e-5)
