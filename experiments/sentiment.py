@@ -18,12 +18,13 @@ from course_lib.fine_tuning import Taught, TokenPPO, Writer, Writing, openings, 
 from experiments.runner import Report, Result
 from solutions import ch45, ch95
 
+BASE = {"kl_coef": 0.05, "iterations": 24, "learning_rate": 6e-4}
 VARIANTS: dict[str, dict[str, Any]] = {
-    **{f"kl_{kl_coef}": {"kl_coef": kl_coef} for kl_coef in (0.0, 0.05, 0.01, 0.2)},
-    "lab_suspect": {"rewards": "whitened"},
-    "per_text": {"rewards": "penalty averaged over the text", "kl_coef": 1.0},
-    "ratio_to_reference": {"update": "ratio to the reference"},
-    "lab_repaired": {"rewards": "scaled"},
+    **{f"kl_{kl_coef}": BASE | {"kl_coef": kl_coef} for kl_coef in (0.0, 0.01, 0.05, 0.2)},
+    "lab_suspect": BASE | {"rewards": "whitened"},
+    "lab_repaired": BASE | {"rewards": "scaled"},
+    "per_text": BASE | {"rewards": "penalty averaged over the text", "kl_coef": 1.0},
+    "ratio_to_reference": BASE | {"update": "ratio to the reference"},
 }
 SEEDS = 5
 EVALUATION_TEXTS = 256
