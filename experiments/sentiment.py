@@ -18,7 +18,7 @@ from course_lib.fine_tuning import Taught, TokenPPO, Writer, Writing, openings, 
 from experiments.runner import Report, Result
 from solutions import ch45, ch95
 
-BASE = {"kl_coef": 0.05, "iterations": 24, "learning_rate": 6e-4}
+BASE = {"kl_coef": 0.01, "iterations": 24, "learning_rate": 6e-4}
 VARIANTS: dict[str, dict[str, Any]] = {
     **{f"kl_{kl_coef}": BASE | {"kl_coef": kl_coef} for kl_coef in (0.0, 0.01, 0.05, 0.2)},
     "lab_suspect": BASE | {"rewards": "whitened"},
