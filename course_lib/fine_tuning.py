@@ -56,12 +56,12 @@ class TokenPPO:
     """Everything that one may choose in PPO on tokens. `learning_rate` is the policy's; the critic is small and has its own."""
 
     kl_coef: float = 0.05  # in units of score per nat
-    iterations: int = 24
+    iterations: int = 40
     batch: int = 64  # texts of an iteration
     new_tokens: int = 20
     epochs: int = 2
     minibatch: int = 32
-    learning_rate: float = 6e-4
+    learning_rate: float = 3e-4
     critic_learning_rate: float = 2e-3
     gamma: float = 1.0
     gae_lambda: float = 0.95
