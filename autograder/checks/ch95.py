@@ -410,9 +410,9 @@ def _mask(generator, batch, length, shape="middle"):
     return (columns >= start[:, None]) & (columns < (start + count)[:, None])
 
 
-def _garbage(mask, x):
+def _garbage(mask, x, times=1000):
     """Padding holds numbers a thousand times as large."""
-    return torch.where(mask, x, 1000 * x)
+    return torch.where(mask, x, times * x)
 
 
 def _penalised(batch=5, length=8, kl_coef=0.1, shape="middle", spread=1.0):
@@ -887,12 +887,12 @@ MASKED_WHITEN = Exercise(
 # ------------------------------------------------------------------------------------------------------------- masked_gae
 
 
-def _tokens(batch=5, length=8, shape="middle", gamma=0.9, gae_lambda=0.8):
+def _tokens(batch=5, length=8, shape="middle", gamma=0.9, gae_lambda=0.8, padding=1000):
     def inputs(generator):
         mask = _mask(generator, batch, length, shape)
         return {
-            "rewards": _garbage(mask, normal(generator, batch, length)),
-            "values": _garbage(mask, normal(generator, batch, length)),
+            "rewards": _garbage(mask, normal(generator, batch, length), padding),
+            "values": _garbage(mask, normal(generator, batch, length), padding),
             "mask": mask,
             "gamma": gamma,
             "gae_lambda": gae_lambda,
@@ -1011,7 +1011,7 @@ MASKED_GAE = Exercise(
         Case("completions in the middle of their rows", _tokens(), closed_form=_gae_by_sums, visible=True, draws=3),
         Case("completions at the end of their rows", _tokens(shape="right"), closed_form=_gae_by_sums, visible=True),
         Case("completions that begin in the first column", _tokens(shape="left"), closed_form=_gae_by_sums),
-        Case("every token kept", _all_kept(_tokens(length=5)), closed_form=_gae_by_sums),
+        Case("every token kept", _all_kept(_tokens(length=5, padding=1)), closed_form=_gae_by_sums),
         Case("gamma = 1, gae_lambda = 1: rewards to go minus values", _tokens(gamma=1, gae_lambda=1), closed_form=_rewards_to_go),
         Case("gae_lambda = 0: one-step residuals", _tokens(gae_lambda=0), closed_form=_gae_by_sums),
         Case("gamma = 0: reward minus value", _tokens(gamma=0), closed_form=_gae_by_sums),
