@@ -21,8 +21,8 @@ def liked_texts(split: str) -> list[str]:
 def next_token_loss(policy: lm.LanguageModel, texts: Sequence[str]) -> torch.Tensor:
     """Cross-entropy of the texts' tokens, their end tokens included, in nats a token; scalar."""
     input_ids, mask = policy.encode(texts, ended=True)
-    logps = policy.logits(input_ids, mask)[:, :-1].log_softmax(-1).gather(-1, input_ids[:, 1:, None]).squeeze(-1)
-    return -logps[mask[:, 1:]].mean()
+    predicted = mask[:, 1:]
+    return torch.nn.functional.cross_entropy(policy.logits(input_ids, mask)[:, :-1][predicted], input_ids[:, 1:][predicted])
 
 
 def supervised(
