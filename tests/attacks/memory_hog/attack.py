@@ -1,4 +1,7 @@
-"""Takes memory, in one process and in many, until something gives."""
+"""Takes memory, in one process and in many, until something gives.
+
+Which limit strikes first, that of memory or that of time, depends on how fast the machine hands out pages.
+"""
 
 from pathlib import Path
 
