@@ -1,7 +1,4 @@
-"""Takes memory, in one process and in many, until something gives.
-
-Which limit strikes first, that of memory or that of time, depends on how fast the machine hands out pages.
-"""
+"""Takes memory, in one process and in many, until something gives."""
 
 from pathlib import Path
 
