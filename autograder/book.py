@@ -42,8 +42,8 @@ HOW_TO = ("how-to/learners", "how-to/teachers", "how-to/contributors")
 MATHJAX = ("tex-chtml-full.js", "output/chtml/fonts/**/*", "a11y/*", "sre/**/*")
 # The library's modules that no kill matrix depends on: it takes minutes, so a new plot must not ask for it again.
 WITHOUT_A_SAY = (
-    "artefact", "chapters", "check", "checking", "command", "fine_tuning", "flight", "interactive", "lm", "notebook", "plotting",
-    "preferences", "records", "statistics", "variety", "videos",
+    "artefact", "chapters", "check", "checking", "command", "direct", "fine_tuning", "flight", "interactive", "judges", "lm", "notebook",
+    "plotting", "preferences", "records", "reward_models", "rlhf", "statistics", "variety", "videos",
 )  # fmt: skip
 
 __all__ = ["BookError", "build", "executed_outputs"]

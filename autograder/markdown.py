@@ -249,6 +249,8 @@ def _rendered(block: Block, dialect: Dialect) -> str:
         return dialect.math(block)
     if block.kind == "quiz":
         return _quiz(block, dialect)
+    if block.kind == "dropdown" and any(match["role"] or match["chapter"] for match in _INLINE.finditer(block.argument)):
+        raise MarkdownError(block.line, "a fold's title holds no link, as it is a button itself: put the link into the fold")
     body = render(block.text, dialect, block.body_line)
     return dialect.directive(block, body.strip("\n"), _inline(block.argument, dialect, block.line))
 

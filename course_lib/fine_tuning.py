@@ -61,7 +61,7 @@ class TokenPPO:
     new_tokens: int = 20
     epochs: int = 2
     minibatch: int = 32
-    learning_rate: float = 2e-4
+    learning_rate: float = 3e-4
     critic_learning_rate: float = 2e-3
     gamma: float = 1.0
     gae_lambda: float = 0.95
@@ -137,34 +137,48 @@ class Writer:
         return self.taught.per_token_logps(self.policy.logits(input_ids, attention_mask), input_ids)
 
 
-def update(
-    writer: Writer, critic, optimizer, writing: Writing, settings: TokenPPO, generator: torch.Generator
-) -> dict[str, float]:
-    """Estimate advantages with the critic as it is, then take a few epochs of minibatches of the clipped loss.
+@torch.no_grad()
+def estimate(writer: Writer, critic, writing: Writing, settings: TokenPPO) -> tuple[torch.Tensor, torch.Tensor]:
+    """Whitened advantages of the tokens, and what the critic should have said of them; (B, L - 1) each."""
+    taught, mask = writer.taught, writing.mask
+    values = critic(writing.features).squeeze(-1)
+    rewards = taught.kl_penalized_rewards(writing.scores, writing.logps, writing.ref_logps, mask, settings.kl_coef)
+    advantages = taught.masked_gae(rewards, values, mask, settings.gamma, settings.gae_lambda)
+    return taught.masked_whiten(advantages, mask), advantages + values
 
-    Returns: the means of policy_loss and value_loss over all minibatches.
+
+def improve(
+    writer: Writer, critic, optimizer, writing: Writing, advantages, returns, settings: TokenPPO, generator: torch.Generator
+) -> dict[str, float]:
+    """A few epochs of minibatches of the clipped loss, and of the critic's.
+
+    Returns: the means over all minibatches of policy_loss, value_loss and clip_fraction, the share of tokens whose ratio to
+      `writing.logps` is out of the clip's interval.
     """
     taught, mask = writer.taught, writing.mask
-    with torch.no_grad():
-        values = critic(writing.features).squeeze(-1)
-        rewards = taught.kl_penalized_rewards(writing.scores, writing.logps, writing.ref_logps, mask, settings.kl_coef)
-        advantages = taught.masked_gae(rewards, values, mask, settings.gamma, settings.gae_lambda)
-        returns = advantages + values
-        advantages = taught.masked_whiten(advantages, mask)
-    losses = []
+    logged = []
     for _ in range(settings.epochs):
         for rows in taught.minibatches(len(mask), settings.minibatch, generator):
+            kept, old_logps = mask[rows], writing.logps[rows]
             logps = writer.logps(writing.samples.input_ids[rows], writing.samples.attention_mask[rows])
-            policy_loss = taught.ppo_token_loss(logps, writing.logps[rows], advantages[rows], mask[rows], settings.clip_range)
+            policy_loss = taught.ppo_token_loss(logps, old_logps, advantages[rows], kept, settings.clip_range)
             value_errors = critic(writing.features[rows]).squeeze(-1) - returns[rows]
-            value_loss = taught.masked_mean(value_errors**2, mask[rows])
+            value_loss = taught.masked_mean(value_errors**2, kept)
             optimizer.zero_grad()
             (policy_loss + value_loss).backward()
             torch.nn.utils.clip_grad_norm_(writer.policy.parameters(), settings.max_grad_norm)
             optimizer.step()
-            losses.append(torch.stack([policy_loss, value_loss]).detach())
-    policy_loss, value_loss = torch.stack(losses).mean(0).tolist()
-    return {"policy_loss": policy_loss, "value_loss": value_loss}
+            outside = ((logps - old_logps).expm1().abs() > settings.clip_range).to(logps.dtype)
+            logged.append(torch.stack([policy_loss, value_loss, taught.masked_mean(outside, kept)]).detach())
+    return dict(zip(("policy_loss", "value_loss", "clip_fraction"), torch.stack(logged).mean(0).tolist(), strict=True))
+
+
+def update(
+    writer: Writer, critic, optimizer, writing: Writing, settings: TokenPPO, generator: torch.Generator
+) -> dict[str, float]:
+    """Estimate advantages with the critic as it is, then improve both policy and critic. Returns: see `improve`."""
+    advantages, returns = estimate(writer, critic, writing, settings)
+    return improve(writer, critic, optimizer, writing, advantages, returns, settings, generator)
 
 
 def train(

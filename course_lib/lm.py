@@ -24,6 +24,7 @@ import huggingface_hub
 import safetensors.torch
 import torch
 import transformers
+from transformers.activations import NewGELUActivation
 
 END = "<|endoftext|>"
 FOLDER = Path(__file__).with_name("models")
@@ -217,6 +218,8 @@ def load(name: str) -> LanguageModel:
     for module in model.modules():
         if isinstance(module, torch.nn.Dropout):
             module.p = 0.0  # a policy that drops units differs from itself: the ratio of PPO's first step would not be 1
+        if isinstance(getattr(module, "act", None), NewGELUActivation):
+            module.act = torch.nn.GELU(approximate="tanh")  # the same function in one kernel: a seventh of a training step
     return model.eval()
 
 

@@ -189,6 +189,18 @@ def flip_labels(preferences: Preferences, rate: float, generator: torch.Generato
     return preferences.swapped(torch.rand(len(preferences), generator=generator) < rate)
 
 
+def comparisons(num_pairs: int, seed: int, split: str = "reward_model") -> Preferences:
+    """What reward models and DPO are trained on: random pairs of film reviews, each answered as two people might, one for each text.
+
+    Args:
+      num_pairs: B, how many.
+      seed: of the pairs and of the answers.
+      split: where the texts are from.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    return ask_two_raters(draw_pairs(load(split), num_pairs, generator), generator)
+
+
 # ---------------------------------------------------------------------------------------------------------- agreement
 
 

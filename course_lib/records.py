@@ -216,7 +216,7 @@ class Records:
         return " ".join([f"course experiment {self.experiment}", *(f"--variant {variant}" for variant in variants)])
 
     def cost(self, *variants: str) -> str:
-        """How long the runs of these variants (of all, by default) took, and on what: part of a sentence, in two lines.
+        """How long the runs of these variants (of all, by default) took, and on what: part of a sentence, in three lines.
 
         Such as "20 runs of 2 to 4 minutes each, 1.1 hours in all by the clock and 16 minutes of processor time, on a machine with 2
         cores (AMD EPYC) and 24 GB of memory": the clock of a machine that did other work beside them runs fast.
@@ -227,7 +227,7 @@ class Records:
         each = longest if shortest == longest else f"{shortest} to {longest}"
         machines = dict.fromkeys(machine(run.provenance["machine"]) for run in runs)
         what = f"{len(runs)} runs of {each} each, {duration(wall.sum())} in all" if len(runs) > 1 else f"one run of {each}"
-        return f"{what} by the clock and {duration(cpu.sum())} of processor time,\non {' and '.join(machines)}"
+        return f"{what} by the clock\nand {duration(cpu.sum())} of processor time,\non {' and '.join(machines)}"
 
     def _again(self, variant: str) -> str:
         return f"`{self.command(variant)}` makes it again, once its record is deleted"

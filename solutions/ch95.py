@@ -170,3 +170,22 @@ def ppo_token_loss(logps, old_logps, advantages, mask, clip_range=0.2):
     ratio = (logps - old_logps.detach())[mask].exp()
     weights = advantages.detach()[mask]
     return -torch.minimum(ratio * weights, ratio.clamp(1 - clip_range, 1 + clip_range) * weights).mean()
+
+
+def repaired_reward_scaling(rewards, mask, eps=1e-8):
+    """What the suspect program of the bug lab should have handed to masked_gae in place of raw rewards.
+
+    Rewards on a scale of their own, whatever the unit of the score: the kept entries of
+    the batch have unit standard deviation (around their mean), and every text is as much
+    better or worse than every other as it was, but for that unit.
+
+    Args:
+      rewards: of every token, in units of score; (B, L').
+      mask: True at the completion's tokens; (B, L') bool.
+      eps: ε ≥ 0, added to the variance.
+
+    Returns: (B, L') dimensionless rewards, 0 where the mask is False.
+    Raises: ValueError if the shapes differ.
+    """
+    variance = masked_mean((rewards - masked_mean(rewards, mask)) ** 2, mask)
+    return torch.where(mask, rewards / (variance + eps).sqrt(), 0)

@@ -101,3 +101,26 @@ def length_correlation(scores, lengths):
     a = scores.detach() - scores.detach().mean()
     b = lengths.to(scores.dtype) - lengths.to(scores.dtype).mean()
     return (a * b).sum() / (a.square().sum() * b.square().sum()).sqrt()
+
+
+def repaired_choices(first, second, first_ratings, second_ratings):
+    """The comparisons that the suspect program of the bug lab should have trained on.
+
+    In each pair the text with the higher rating is chosen. A pair whose two ratings are
+    equal says nothing about which text is better, and is left out.
+
+    Args:
+      first, second: which two texts of the collection each pair compares, by their index;
+        (B,) int64.
+      first_ratings, second_ratings: what one person said of either text; (B,) integers or
+        floating point.
+
+    Returns: chosen, rejected: indices of texts, in the order of the pairs without those
+      that are left out; two tensors of one length, int64.
+    Raises: ValueError if the shapes differ.
+    """
+    validate.same_shape(first=first, second=second, first_ratings=first_ratings, second_ratings=second_ratings)
+    decided = first_ratings != second_ratings
+    first_wins = (first_ratings > second_ratings)[decided]
+    first, second = first[decided], second[decided]
+    return torch.where(first_wins, first, second), torch.where(first_wins, second, first)

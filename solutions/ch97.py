@@ -121,3 +121,18 @@ def kl_optimal_policy(ref_probs, rewards, beta):
     validate.same_shape(ref_probs=ref_probs, rewards=rewards)
     validate.positive(beta=beta)
     return (ref_probs.log() + rewards / beta).softmax(-1)
+
+
+def repaired_completion_mask(attention_mask, prompt_lengths):
+    """Which tokens of each text the suspect program of the bug lab should have counted.
+
+    Args:
+      attention_mask: True at a text's own tokens, prompt and end token included, False at
+        padding on either side; (B, L) bool.
+      prompt_lengths: how many of a text's own tokens are its prompt; (B,) int64.
+
+    Returns: (B, L) bool, True at the tokens that the policy would have to write.
+    Raises: ValueError if the numbers of rows differ.
+    """
+    validate.same_length(attention_mask=attention_mask, prompt_lengths=prompt_lengths)
+    return attention_mask & (attention_mask.cumsum(1) > prompt_lengths[:, None])

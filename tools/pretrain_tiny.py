@@ -226,7 +226,7 @@ def write(model: GPT2LMHeadModel, tokenizer: Tokenizer, state: dict, test: list[
     weights = {name: value.half().contiguous() for name, value in model.state_dict().items() if name != "lm_head.weight"}
     safetensors.torch.save_file(weights, TARGET / "model.safetensors", metadata={"format": "pt"})
     (TARGET / "model.safetensors").chmod(0o644)
-    tokenizer.save(str(TARGET / "tokenizer.json"))
+    tokenizer.save(str(TARGET / "tokenizer.json"), pretty=False)
     model.config.architectures = ["GPT2LMHeadModel"]
     model.config.to_json_file(TARGET / "config.json")
     facts = {

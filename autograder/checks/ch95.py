@@ -9,6 +9,7 @@ import torch
 from torch.nn import functional
 
 from autograder.mistakes import (
+    IN_PLACE,
     SHAPES,
     after,
     cut_from_graph,
@@ -369,15 +370,13 @@ COMPLETION_MASK = Exercise(
             after(ch95.completion_mask, torch.Tensor.long),
             "Masks are bool: `~mask` of an integer is something else, and indexing with it picks rows.",
         ),
-        in_place(ch95.completion_mask, "input_ids")
-        if False
-        else Misconception(
+        Misconception(
             "input-changed",
             lambda input_ids, prompt_lengths, eos_token_id: (
                 ch95.completion_mask(input_ids, prompt_lengths, eos_token_id),
                 prompt_lengths.add_(1),
             )[0],
-            "The caller's tensor is changed (by += or a method that ends in _).",
+            IN_PLACE,
         ),
         Misconception("bad-input-accepted", _completions(_kept, checked=False), SHAPES),
     ),
@@ -411,9 +410,9 @@ def _mask(generator, batch, length, shape="middle"):
     return (columns >= start[:, None]) & (columns < (start + count)[:, None])
 
 
-def _garbage(mask, x):
+def _garbage(mask, x, times=1000):
     """Padding holds numbers a thousand times as large."""
-    return torch.where(mask, x, 1000 * x)
+    return torch.where(mask, x, times * x)
 
 
 def _penalised(batch=5, length=8, kl_coef=0.1, shape="middle", spread=1.0):
@@ -888,12 +887,12 @@ MASKED_WHITEN = Exercise(
 # ------------------------------------------------------------------------------------------------------------- masked_gae
 
 
-def _tokens(batch=5, length=8, shape="middle", gamma=0.9, gae_lambda=0.8):
+def _tokens(batch=5, length=8, shape="middle", gamma=0.9, gae_lambda=0.8, padding=1000):
     def inputs(generator):
         mask = _mask(generator, batch, length, shape)
         return {
-            "rewards": _garbage(mask, normal(generator, batch, length)),
-            "values": _garbage(mask, normal(generator, batch, length)),
+            "rewards": _garbage(mask, normal(generator, batch, length), padding),
+            "values": _garbage(mask, normal(generator, batch, length), padding),
             "mask": mask,
             "gamma": gamma,
             "gae_lambda": gae_lambda,
@@ -1012,7 +1011,7 @@ MASKED_GAE = Exercise(
         Case("completions in the middle of their rows", _tokens(), closed_form=_gae_by_sums, visible=True, draws=3),
         Case("completions at the end of their rows", _tokens(shape="right"), closed_form=_gae_by_sums, visible=True),
         Case("completions that begin in the first column", _tokens(shape="left"), closed_form=_gae_by_sums),
-        Case("every token kept", _all_kept(_tokens(length=5)), closed_form=_gae_by_sums),
+        Case("every token kept", _all_kept(_tokens(length=5, padding=1)), closed_form=_gae_by_sums),
         Case("gamma = 1, gae_lambda = 1: rewards to go minus values", _tokens(gamma=1, gae_lambda=1), closed_form=_rewards_to_go),
         Case("gae_lambda = 0: one-step residuals", _tokens(gae_lambda=0), closed_form=_gae_by_sums),
         Case("gamma = 0: reward minus value", _tokens(gamma=0), closed_form=_gae_by_sums),
@@ -1328,6 +1327,151 @@ PPO_TOKEN_LOSS = Exercise(
     },
 )
 
+# ------------------------------------------------------------------------------------------------- repaired_reward_scaling
+
+
+def _paid(batch=5, length=8, shape="middle", score=2.0):
+    """Small penalties for every token, a score at each text's last one, padding that holds anything."""
+
+    def inputs(generator):
+        mask = _mask(generator, batch, length, shape)
+        mask[0] = torch.arange(length) == 1
+        mask[1] = torch.arange(length) > 0
+        penalties = -0.1 + 0.2 * normal(generator, batch, length)
+        scores = score + normal(generator, batch, 1)
+        return {"rewards": _garbage(mask, penalties + scores * _last(mask)), "mask": mask}
+
+    return inputs
+
+
+def _scaled_by_list(rewards, mask):
+    kept = _listed(rewards, mask)
+    mean = math.fsum(kept) / len(kept)
+    deviation = math.sqrt(math.fsum((value - mean) ** 2 for value in kept) / len(kept) + 1e-8)
+    return torch.tensor(
+        [
+            [value / deviation if keep else 0.0 for value, keep in zip(row, flags, strict=True)]
+            for row, flags in zip(rewards.tolist(), mask.tolist(), strict=True)
+        ],
+        dtype=rewards.dtype,
+    )
+
+
+def _scaled(by, shift=lambda x, m: 0.0, back=lambda x, m: 0.0, zero=True):
+    """A version: `shift` is subtracted, `by` divides, `back` is added; each takes rewards and mask."""
+
+    def formula(rewards, mask, eps=1e-8):
+        scaled = (rewards - shift(rewards, mask)) / (by(rewards, mask) + eps) + back(rewards, mask)
+        return _zeroed(scaled, mask) if zero else scaled
+
+    return _masked(formula)
+
+
+def _other_scaling(deviation):
+    """Also right: the contract leaves the kind of deviation and the place of eps open."""
+
+    def version(rewards, mask, eps=1e-8):
+        ch95.repaired_reward_scaling(rewards, mask, eps)
+        return _zeroed(rewards / deviation(rewards[mask], eps), mask)
+
+    return version
+
+
+_LEVEL = (
+    "A constant is taken from the reward of every token: a text of n tokens then gains or loses n times as much, and the policy learns to"
+    " stop early or late. Change the unit only."
+)
+
+REPAIRED_REWARD_SCALING = Exercise(
+    name="repaired_reward_scaling",
+    reference=ch95.repaired_reward_scaling,
+    also_right=(
+        _other_scaling(lambda kept, eps: kept.std(correction=0) + eps),
+        _other_scaling(lambda kept, eps: kept.std() + eps),
+    ),
+    criteria={"values": 1.7, "dtype": 0.1, "inputs": 0.1, "errors": 0.1},
+    axes=("text", "t"),
+    cases=drawn_once(
+        Case("scores at the ends of texts of all lengths", _paid(), closed_form=_scaled_by_list, visible=True, draws=3),
+        Case("texts at the end of their rows", _paid(shape="right"), closed_form=_scaled_by_list, visible=True),
+        Case("bad scores", _paid(score=-3.0), closed_form=_scaled_by_list),
+        Case("scores a thousand times as large", _paid(score=2000.0), closed_form=_scaled_by_list),
+        Case("every token kept", _all_kept(_paid(length=5)), closed_form=_scaled_by_list),
+        Case("single precision", _paid(), dtype=torch.float32, visible=True),
+        *shape_cases(_paid(), ("rewards", "mask")),
+    ),
+    misconceptions=(
+        Misconception("mean-subtracted", _scaled(_kept_std, shift=_kept_mean), _LEVEL),
+        Misconception(
+            "mean-subtracted-and-added-back",
+            _scaled(_kept_std, shift=_kept_mean, back=_kept_mean),
+            "(x - mean) / std + mean still moves every token by mean * (1 - 1 / std): divide, and subtract nothing.",
+        ),
+        Misconception(
+            "mean-of-each-text-subtracted",
+            _scaled(_kept_std, shift=_row_stats(torch.mean)),
+            "With its own mean taken away, every text is worth 0 in sum: nothing tells a good one from a bad one.",
+        ),
+        Misconception(
+            "mean-score-subtracted-at-the-end",
+            _scaled(_kept_std, shift=lambda x, m: x[_last(m)].mean() * _last(m)),
+            "The mean score is taken from the last reward: no text's rank changes, but the deviation of what is returned is no longer 1.",
+        ),
+        Misconception(
+            "a-scale-for-each-text",
+            _scaled(_row_stats(lambda kept: kept.std(correction=0))),
+            "Each text has a unit of its own, so texts can no longer be compared: one deviation for the batch.",
+        ),
+        Misconception(
+            "root-mean-square",
+            _scaled(lambda x, m: x[m].square().mean().sqrt()),
+            "This is the root mean square: the deviation is taken around the mean, although the mean is not subtracted from the rewards.",
+        ),
+        Misconception(
+            "divided-by-variance",
+            _scaled(lambda x, m: x[m].var(correction=0)),
+            "Divide by the standard deviation, the root of the variance.",
+        ),
+        Misconception(
+            "deviation-over-padding",
+            _scaled(lambda x, m: x.std()),
+            "The deviation is taken over padding too. " + _OUTSIDE,
+        ),
+        Misconception(
+            "padding-counted-as-zeros",
+            _scaled(lambda x, m: _zeroed(x, m).std()),
+            "Padding is zeroed and then counted, which makes the deviation smaller: it is over kept entries only.",
+        ),
+        Misconception(
+            "deviation-of-the-last-rewards",
+            _scaled(lambda x, m: x[_last(m)].std(correction=0)),
+            "This is the deviation of the texts' last rewards: take that of all kept entries.",
+        ),
+        Misconception("not-scaled", _scaled(lambda x, m: 1.0), "The rewards are as they were: bring them to unit deviation."),
+        Misconception("padding-not-zeroed", _scaled(_kept_std, zero=False), _ZERO),
+        dtype_lost(ch95.repaired_reward_scaling),
+        in_place(ch95.repaired_reward_scaling, "rewards"),
+        Misconception(
+            "bad-input-accepted",
+            _masked(lambda x, m, eps=1e-8: torch.where(m, x / (x[m.expand_as(x)].var() + eps).sqrt(), 0), checked=False),
+            SHAPES,
+        ),
+    ),
+    variants={
+        "list": _masked(lambda x, m, eps=1e-8: _scaled_by_list(x, m)),
+        "unbiased deviation": _scaled(lambda x, m: x[m].std()),
+        "whitened, and the mean put back in its new unit": _masked(
+            lambda x, m, eps=1e-8: _zeroed(ch95.masked_whiten(x, m, eps) + _kept_mean(x, m) / (_kept_std(x, m) + eps), m)
+        ),
+        "mean of squares minus square of the mean": _scaled(
+            lambda x, m: (x[m].square().mean() - x[m].mean().square()).clamp(min=0).sqrt()
+        ),
+        "in double precision": _masked(
+            lambda x, m, eps=1e-8: _zeroed(x.double() / (x[m].double().var(correction=0) + eps).sqrt(), m).to(x.dtype)
+        ),
+    },
+)
+
 EXERCISES = (
     PER_TOKEN_LOGPS,
     COMPLETION_MASK,
@@ -1336,4 +1480,5 @@ EXERCISES = (
     MASKED_WHITEN,
     MASKED_GAE,
     PPO_TOKEN_LOSS,
+    REPAIRED_REWARD_SCALING,
 )

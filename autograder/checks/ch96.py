@@ -713,4 +713,179 @@ LENGTH_CORRELATION = Exercise(
     },
 )
 
-EXERCISES = (LAST_TOKEN_SCORES, REWARD_MODEL_LOSS, BEST_OF_N, BEST_OF_N_KL, LENGTH_CORRELATION)
+# ------------------------------------------------------------------------------------------------------ repaired_choices
+
+_PAIR = ("first", "second", "first_ratings", "second_ratings")
+
+
+def _opinions(low, high, batch=14, kind=torch.int8):
+    """Pairs of texts and ratings from low to high; two of the pairs are ties and two are decided, one each way."""
+
+    def inputs(generator):
+        texts = torch.randperm(40, generator=generator)[: 2 * batch]
+        ratings = integers(generator, low, high + 1, 2, batch)
+        ratings[:, :4] = torch.tensor([[low, high, high, low], [low, high, low, high]])
+        ratings = ratings[:, torch.randperm(batch, generator=generator)].to(kind)
+        return dict(zip(_PAIR, (texts[:batch], texts[batch:], *ratings), strict=True))
+
+    return inputs
+
+
+def _without(tied):
+    def inputs(generator):
+        drawn = _opinions(-4, 4)(generator)
+        keep = (drawn["first_ratings"] == drawn["second_ratings"]) == tied
+        return {name: value[keep] for name, value in drawn.items()}
+
+    return inputs
+
+
+def _pair_by_pair(first, second, first_ratings, second_ratings):
+    kept = []
+    for a, b, rating_a, rating_b in zip(
+        first.tolist(), second.tolist(), first_ratings.tolist(), second_ratings.tolist(), strict=True
+    ):
+        if rating_a > rating_b:
+            kept.append((a, b))
+        elif rating_b > rating_a:
+            kept.append((b, a))
+    table = torch.tensor(kept, dtype=torch.int64).reshape(-1, 2)
+    return table[:, 0], table[:, 1]
+
+
+def _choices(formula, checked=True):
+    """A version: `formula` takes all four and is protected from unequal shapes."""
+
+    def version(first, second, first_ratings, second_ratings):
+        given = (second, first_ratings, second_ratings)
+        if checked and any(other.shape != first.shape for other in given):
+            raise ValueError(f"first has shape {tuple(first.shape)}, but second, first_ratings or second_ratings has another")
+        return formula(first, second, first_ratings, second_ratings)
+
+    return version
+
+
+def _decided_by(wins, keep):
+    """A version by two masks, each a function of the ratings: where the first text wins, and which pairs count."""
+
+    def formula(first, second, a, b):
+        kept, first_wins = keep(a, b), wins(a, b)
+        return torch.where(first_wins, first, second)[kept], torch.where(first_wins, second, first)[kept]
+
+    return _choices(formula)
+
+
+def _everything(a, b):
+    return torch.ones_like(a, dtype=torch.bool)
+
+
+def _by_winner(first, second, a, b):
+    """First the pairs that the first text wins, then the others."""
+    return torch.cat([first[a > b], second[b > a]]), torch.cat([second[a > b], first[b > a]])
+
+
+def _by_gather(first, second, a, b):
+    table = torch.stack([first, second], dim=1)[a != b]  # (B', 2)
+    better = torch.stack([a, b], dim=1)[a != b].argmax(1, keepdim=True)
+    return table.gather(1, better)[:, 0], table.gather(1, 1 - better)[:, 0]
+
+
+def _by_sign(first, second, a, b):
+    sign = (a.long() - b.long()).sign() if not a.is_floating_point() else (a - b).sign().long()
+    rows = sign.nonzero().squeeze(1)
+    middle, half = first + second, (first - second) * sign
+    return ((middle + half) // 2)[rows], ((middle - half) // 2)[rows]
+
+
+def _pairs_by_numpy(first, second, a, b):
+    first, second, a, b = (x.numpy() for x in (first, second, a, b))
+    kept = np.flatnonzero(a != b)
+    return (torch.from_numpy(np.where(wins, x, y)[kept]) for wins, x, y in ((a > b, first, second), (a > b, second, first)))
+
+
+def _cut_to_the_shortest(first, second, a, b):
+    rows = min(map(len, (first, second, a, b)))
+    return ch96.repaired_choices(first[:rows], second[:rows], a[:rows], b[:rows])
+
+
+REPAIRED_CHOICES = Exercise(
+    name="repaired_choices",
+    reference=ch96.repaired_choices,
+    criteria={"values": 1.7, "dtype": 0.1, "errors": 0.2},
+    cases=drawn_once(
+        Case("ratings from -4 to 4", _opinions(-4, 4), closed_form=_pair_by_pair, visible=True, draws=3),
+        Case("negative, neutral or positive", _opinions(-1, 1), closed_form=_pair_by_pair, visible=True, draws=3),
+        Case("stars as floating-point numbers", _opinions(1, 5, kind=torch.float32), closed_form=_pair_by_pair, visible=True),
+        Case("no ties", _without(tied=False), closed_form=_pair_by_pair),
+        Case("nothing but ties", _without(tied=True), closed_form=_pair_by_pair),
+        *shape_cases(_opinions(-1, 1), _PAIR),
+    ),
+    misconceptions=(
+        Misconception(
+            "ties-to-the-first",
+            _decided_by(lambda a, b: a >= b, _everything),
+            "This is the suspect's rule: a tie counts as a victory of the first text, and which text comes first is no accident.",
+        ),
+        Misconception(
+            "ties-to-the-second",
+            _decided_by(lambda a, b: a > b, _everything),
+            "Now ties count as victories of the second text: the same fault the other way round. A tie says nothing.",
+        ),
+        Misconception(
+            "ties-at-random",
+            _decided_by(lambda a, b: (a > b) | ((a == b) & (torch.arange(len(a)) % 2 == 0)), _everything),
+            "Ties that fall to either side by turns teach no length, but they are noise: leave them out.",
+        ),
+        Misconception(
+            "chosen-and-rejected-swapped",
+            _decided_by(lambda a, b: a < b, lambda a, b: a != b),
+            "The text with the higher rating is chosen: here it is rejected.",
+        ),
+        Misconception(
+            "only-where-the-first-wins",
+            _decided_by(lambda a, b: a > b, lambda a, b: a > b),
+            "Pairs that the second text wins are left out as well: now the first text always wins, which is worse than before.",
+        ),
+        Misconception(
+            "only-where-the-second-wins",
+            _decided_by(lambda a, b: a > b, lambda a, b: a < b),
+            "Pairs that the first text wins are left out as well: only ties say nothing.",
+        ),
+        Misconception(
+            "neutral-left-out",
+            _decided_by(lambda a, b: a > b, lambda a, b: (a != 0) & (b != 0) & (a != b)),
+            "A neutral text against a positive one is a clear preference: leave out equal ratings, not ratings of 0.",
+        ),
+        Misconception(
+            "ties-kept-the-rest-left-out",
+            _decided_by(lambda a, b: a >= b, lambda a, b: a == b),
+            "The mask is the wrong way round: these are the pairs that say nothing.",
+        ),
+        Misconception(
+            "positions-of-pairs",
+            _choices(lambda first, second, a, b: ((a > b).nonzero().squeeze(1), (b > a).nonzero().squeeze(1))),
+            "These are positions in the list of pairs: indices of texts are asked for, from first and second.",
+        ),
+        Misconception(
+            "order-lost",
+            _choices(_by_winner),
+            "The pairs have changed their order: whatever else is known of each pair no longer belongs to it.",
+        ),
+        Misconception(
+            "int32",
+            after(ch96.repaired_choices, lambda pair: tuple(index.int() for index in pair)),
+            "Indices are int64, or they index nothing in older code.",
+        ),
+        in_place(ch96.repaired_choices, "first"),
+        Misconception("bad-input-accepted", _choices(_cut_to_the_shortest, checked=False), SHAPES),
+    ),
+    variants={
+        "pair by pair in Python": _choices(_pair_by_pair),
+        "gather": _choices(_by_gather),
+        "sign of the difference": _choices(_by_sign),
+        "NumPy": _choices(lambda *given: tuple(_pairs_by_numpy(*given))),
+        "masks": _decided_by(lambda a, b: a > b, lambda a, b: a.ne(b)),
+    },
+)
+
+EXERCISES = (LAST_TOKEN_SCORES, REWARD_MODEL_LOSS, BEST_OF_N, BEST_OF_N_KL, LENGTH_CORRELATION, REPAIRED_CHOICES)

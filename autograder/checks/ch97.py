@@ -861,4 +861,155 @@ KL_OPTIMAL_POLICY = Exercise(
     },
 )
 
-EXERCISES = (SEQUENCE_LOGPS, DPO_LOSS, IPO_LOSS, KL_OPTIMAL_POLICY)
+# ------------------------------------------------------------------------------------------------ repaired_completion_mask
+
+
+def _padded(left=(0, 4), right=(0, 4), prompt=(1, 4), completion=(1, 5), batch=5):
+    """Texts of unequal length with padding on either side; the ranges are half open."""
+
+    def inputs(generator):
+        before, given, written, after_it = (integers(generator, *span, batch) for span in (left, prompt, completion, right))
+        columns, stop = torch.arange(int((before + given + written + after_it).max())), before + given + written
+        return {
+            "attention_mask": (columns >= before[:, None]) & (columns < stop[:, None]),
+            "prompt_lengths": given,
+        }
+
+    return inputs
+
+
+def _mask_by_walk(attention_mask, prompt_lengths):
+    kept = torch.zeros_like(attention_mask)
+    for row, prompt in enumerate(prompt_lengths.tolist()):
+        own = attention_mask[row].nonzero().flatten()
+        kept[row, own[prompt:]] = True
+    return kept
+
+
+def _repair(formula, checked=True):
+    """A version: `formula` takes the mask (B, L), columns (L,) and the prompts' lengths (B, 1)."""
+
+    def version(attention_mask, prompt_lengths):
+        if checked and len(attention_mask) != len(prompt_lengths):
+            raise ValueError(f"attention_mask has {len(attention_mask)} rows, but prompt_lengths has {len(prompt_lengths)}")
+        rows = len(prompt_lengths) if len(prompt_lengths) > 1 else len(attention_mask)
+        mask = attention_mask[:rows]
+        return formula(mask, torch.arange(mask.shape[1]), prompt_lengths[: len(mask), None])
+
+    return version
+
+
+def _starts(mask):
+    """The column of each row's first own token; (B, 1)."""
+    return mask.int().argmax(1, keepdim=True)
+
+
+def _own(mask, columns, prompts):
+    return mask & (columns >= _starts(mask) + prompts)
+
+
+def _last(mask):
+    """True at each row's last own token."""
+    return mask & (mask.flip(1).cumsum(1).flip(1) == 1)
+
+
+REPAIRED_COMPLETION_MASK = Exercise(
+    name="repaired_completion_mask",
+    reference=ch97.repaired_completion_mask,
+    criteria={"values": 1.7, "dtype": 0.1, "inputs": 0.1, "errors": 0.1},
+    axes=("text", "column"),
+    cases=drawn_once(
+        Case("padding on the right", _padded(left=(0, 1)), closed_form=_mask_by_walk, visible=True, draws=3),
+        Case(
+            "every text begins with one given token", _padded(left=(0, 1), prompt=(1, 2)), closed_form=_mask_by_walk, visible=True
+        ),
+        Case("padding on the left", _padded(right=(0, 1)), closed_form=_mask_by_walk, visible=True, draws=3),
+        Case("padding on both sides", _padded(left=(1, 4), right=(1, 4)), closed_form=_mask_by_walk, draws=3),
+        Case("no padding", _padded((0, 1), (0, 1), (2, 3), (4, 5)), closed_form=_mask_by_walk, visible=True),
+        Case("completions of one token", _padded(completion=(1, 2)), closed_form=_mask_by_walk),
+        Case("no prompt at all", _padded(prompt=(0, 1)), closed_form=_mask_by_walk),
+        Case("one text", _padded(left=(1, 3), right=(1, 3), batch=1), closed_form=_mask_by_walk),
+        *shape_cases(_padded(), ("attention_mask", "prompt_lengths")),
+    ),
+    misconceptions=(
+        Misconception(
+            "padding-counted",
+            _repair(lambda mask, columns, prompts: columns >= prompts),
+            "This is the suspect program's own bug: all columns behind the prompt count, also those behind the text's end, where no"
+            " sample ever goes.",
+        ),
+        Misconception(
+            "padding-behind-counted",
+            _repair(lambda mask, columns, prompts: columns >= _starts(mask) + prompts),
+            "The prompt is found wherever the text begins, but what stands behind the end of the text still counts: that is padding.",
+        ),
+        Misconception(
+            "prompt-counted",
+            _repair(lambda mask, columns, prompts: mask & (prompts >= 0)),
+            "The prompt's tokens count as well. They were given, not written: leave out the first prompt_lengths[b] own tokens.",
+        ),
+        Misconception(
+            "padding-on-the-left-forgotten",
+            _repair(lambda mask, columns, prompts: mask & (columns >= prompts)),
+            "With padding on the left the prompt does not begin in column 0: count own tokens, not columns.",
+        ),
+        Misconception(
+            "end-token-dropped",
+            _repair(lambda mask, columns, prompts: _own(mask, columns, prompts) & ~_last(mask)),
+            "The last own token is the end of the text. To stop there is a choice of the policy's like any other, so it counts.",
+        ),
+        Misconception(
+            "one-token-early",
+            _repair(lambda mask, columns, prompts: mask & (columns >= _starts(mask) + prompts - 1)),
+            "The mask is aligned with the tokens, and sequence_logps shifts it: it begins at the first written token, not before it.",
+        ),
+        Misconception(
+            "one-token-late",
+            _repair(lambda mask, columns, prompts: mask & (columns > _starts(mask) + prompts)),
+            "The first written token is missing: the policy chose it, and the prompt's last position predicts it.",
+        ),
+        Misconception(
+            "mask-inverted",
+            _repair(lambda mask, columns, prompts: ~_own(mask, columns, prompts)),
+            "True marks the tokens that count: this keeps all the others.",
+        ),
+        Misconception(
+            "one-prompt-length-for-all",
+            _repair(lambda mask, columns, prompts: _own(mask, columns, prompts.amin(0, keepdim=True))),
+            "Each text has a prompt length of its own: here the shortest is used for all.",
+        ),
+        Misconception(
+            "integers",
+            after(ch97.repaired_completion_mask, torch.Tensor.long),
+            "Masks are bool: `~mask` of an integer is something else, and indexing with it picks rows.",
+        ),
+        Misconception(
+            "input-changed",
+            lambda attention_mask, prompt_lengths: (
+                ch97.repaired_completion_mask(attention_mask, prompt_lengths),
+                attention_mask.logical_not_(),
+            )[0],
+            "The caller's tensor is changed (by &= or a method that ends in _), and the network is given it afterwards.",
+        ),
+        Misconception("bad-input-accepted", _repair(_own, checked=False), SHAPES),
+    ),
+    variants={
+        "walk": lambda attention_mask, prompt_lengths: (
+            _repair(_own)(attention_mask, prompt_lengths) & _mask_by_walk(attention_mask, prompt_lengths)
+        ),
+        "columns from the first own token": _repair(_own),
+        "positions as the network counts them": _repair(
+            lambda mask, columns, prompts: mask & ((mask.cumsum(1) - 1).clamp(min=0) >= prompts)
+        ),
+        "own tokens from the back": _repair(
+            lambda mask, columns, prompts: mask & (mask.flip(1).cumsum(1).flip(1) <= mask.sum(1, keepdim=True) - prompts)
+        ),
+        "NumPy": _repair(
+            lambda mask, columns, prompts: torch.from_numpy(
+                np.logical_and(mask.numpy(), np.cumsum(mask.numpy(), axis=1) > prompts.numpy())
+            )
+        ),
+    },
+)
+
+EXERCISES = (SEQUENCE_LOGPS, DPO_LOSS, IPO_LOSS, KL_OPTIMAL_POLICY, REPAIRED_COMPLETION_MASK)

@@ -73,6 +73,13 @@ def test_a_quiz_in_the_book_is_a_list_and_a_fold_for_the_script_to_wire():
     )
 
 
+@pytest.mark.parametrize("link", ["[chapter 43](chapter:43)", "{eq}`loss`", "{cite:t}`schulman2017`"])
+def test_a_folds_title_holds_no_link(link):
+    with pytest.raises(markdown.MarkdownError, match="holds no link") as caught:
+        _render(f"x\n\n:::{{dropdown}} See {link}\ny\n:::")
+    assert caught.value.line == 3
+
+
 @pytest.mark.parametrize(
     "text, line, message",
     [

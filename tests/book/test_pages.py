@@ -36,6 +36,7 @@ class Visit:
             color_scheme=scheme, viewport={"width": width, "height": 900}, has_touch=look == "phone", offline=True
         )
         self.page = self.context.new_page()
+        self.page.set_default_timeout(120_000)  # a busy machine is slow, not wrong
         self.requests: list[str] = []
         self.complaints: list[str] = []
         self.page.on("request", lambda request: self.requests.append(request.url))

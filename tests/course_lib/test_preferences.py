@@ -141,3 +141,10 @@ def test_a_panel_agrees_with_the_other_panel_more_often_than_one_person_does():
 def test_vader_tells_praise_from_blame():
     praise, blame, nothing = preferences.vader(["A great, wonderful film!", "An awful, boring mess.", "the"]).tolist()
     assert blame < -0.4 and nothing == 0 and praise > 0.4
+
+
+def test_comparisons_repeat_with_their_seed_and_err_as_two_people_do():
+    one, again, other = (preferences.comparisons(4000, seed) for seed in (3, 3, 4))
+    assert torch.equal(one.chosen, again.chosen) and not torch.equal(one.chosen, other.chosen)
+    wrong = (one.gap < 0).float().mean().item()
+    assert wrong == pytest.approx(0.16, abs=0.02)

@@ -94,9 +94,9 @@ def test_the_cost_is_a_part_of_a_sentence(tmp_path):
     on = "on a machine with 2 cores (AMD EPYC) and 24 GB of memory"
     loaded = records.load("toy", tmp_path)
     assert loaded.cost() == (
-        f"2 runs of 4 minutes to 2 hours each, 2.1 hours in all by the clock and 2 minutes of processor time,\n{on}"
+        f"2 runs of 4 minutes to 2 hours each, 2.1 hours in all by the clock\nand 2 minutes of processor time,\n{on}"
     )
-    assert loaded.cost("a") == f"one run of 4 minutes by the clock and 60 seconds of processor time,\n{on}"
+    assert loaded.cost("a") == f"one run of 4 minutes by the clock\nand 60 seconds of processor time,\n{on}"
 
 
 def test_missing_records_name_the_command_that_makes_them(tmp_path):

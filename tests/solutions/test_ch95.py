@@ -14,6 +14,7 @@ from solutions.ch95 import (
     masked_whiten,
     per_token_logps,
     ppo_token_loss,
+    repaired_reward_scaling,
 )
 from solutions.ch97 import sequence_logps
 
@@ -146,3 +147,17 @@ def test_every_kept_token_weighs_alike_whatever_the_length_of_its_text():
 def test_bad_input_is_refused_by_name(call, name):
     with pytest.raises(ValueError, match=name):
         call()
+
+
+def test_scaling_changes_the_unit_and_nothing_else():
+    rewards, mask = rows([0, 0, 4, 9], [0, 2, 77, 77]), masks("xxx.", "xx..")
+    found = repaired_reward_scaling(rewards, mask)
+    deviation = math.sqrt((0 + 0 + 16 + 0 + 4) / 5 - (6 / 5) ** 2)
+    torch.testing.assert_close(found, rows([0, 0, 4 / deviation, 0], [0, 2 / deviation, 0, 0]))
+    assert found[mask].std(correction=0).item() == pytest.approx(1)
+
+
+def test_a_text_of_zeros_stays_worth_nothing_however_long():
+    rewards, mask = rows([0, 0, 0, 0], [3, 0, 0, 0]), masks("xxxx", "x...")
+    assert repaired_reward_scaling(rewards, mask)[0].tolist() == [0, 0, 0, 0]
+    assert masked_whiten(rewards, mask)[0].sum() < -1  # what the suspect program did

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from solutions.ch96 import best_of_n, best_of_n_kl, last_token_scores, length_correlation, reward_model_loss
+from solutions.ch96 import best_of_n, best_of_n_kl, last_token_scores, length_correlation, repaired_choices, reward_model_loss
 
 
 def row(*numbers, dtype=torch.float64):
@@ -94,3 +94,16 @@ def test_length_correlation_by_hand():
 def test_length_correlation_knows_neither_units_nor_origin():
     scores, lengths = torch.randn(30, dtype=torch.float64), torch.randint(5, 50, (30,))
     torch.testing.assert_close(length_correlation(7 * scores - 3, lengths * 2 + 5), length_correlation(scores, lengths))
+
+
+def test_ties_are_left_out_and_the_rest_keeps_its_order():
+    chosen, rejected = repaired_choices(
+        torch.tensor([10, 11, 12, 13]), torch.tensor([20, 21, 22, 23]), torch.tensor([1, 0, -1, 1]), torch.tensor([0, 0, 1, -1])
+    )
+    assert chosen.tolist() == [10, 22, 13] and rejected.tolist() == [20, 12, 23]
+
+
+def test_nothing_but_ties_leaves_nothing():
+    same = torch.tensor([1, 1])
+    chosen, rejected = repaired_choices(torch.tensor([3, 4]), torch.tensor([5, 6]), same, same)
+    assert chosen.shape == rejected.shape == (0,) and chosen.dtype == torch.int64

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from solutions.ch97 import dpo_loss, ipo_loss, kl_optimal_policy, sequence_logps
+from solutions.ch97 import dpo_loss, ipo_loss, kl_optimal_policy, repaired_completion_mask, sequence_logps
 
 
 def row(*numbers, dtype=torch.float64):
@@ -170,3 +170,29 @@ def test_rewards_recovered_from_the_optimum_differ_by_a_constant_only():
 def test_huge_rewards_stay_probabilities_and_impossible_answers_stay_impossible():
     found = kl_optimal_policy(row(0.5, 0.5, 0.0), row(10_000, -10_000, 1e6), beta=0.01)
     assert found.tolist() == [1, 0, 0]
+
+
+# -------------------------------------------------------------------------------------------- repaired_completion_mask
+
+
+def test_the_end_of_a_text_counts_and_what_stands_behind_it_does_not():
+    kept = torch.tensor([[1, 1, 1, 1, 0, 0], [1, 1, 1, 1, 1, 1]]).bool()
+    assert repaired_completion_mask(kept, torch.tensor([1, 2])).int().tolist() == [[0, 1, 1, 1, 0, 0], [0, 0, 1, 1, 1, 1]]
+
+
+def test_the_side_of_the_padding_changes_no_log_probability():
+    generator = torch.Generator().manual_seed(0)
+    logits, ids = torch.randn(1, 4, 6, generator=generator), torch.tensor([[5, 2, 3, 5]])
+    junk, pad = torch.randn(1, 2, 6, generator=generator), torch.tensor([[5, 5]])
+    own, none = torch.ones(1, 4, dtype=torch.bool), torch.zeros(1, 2, dtype=torch.bool)
+    sums = [
+        sequence_logps(
+            torch.cat(parts[0], 1), torch.cat(parts[1], 1), repaired_completion_mask(torch.cat(parts[2], 1), torch.tensor([1]))
+        )
+        for parts in (
+            ([logits], [ids], [own]),
+            ([logits, junk], [ids, pad], [own, none]),
+            ([junk, logits], [pad, ids], [none, own]),
+        )
+    ]
+    torch.testing.assert_close(torch.stack(sums), sums[0].expand(3, 1))

@@ -1,0 +1,189 @@
+"""DPO on human ratings with the tiny language model: weights beta, other losses, an unfrozen reference, a silent bug (chapter 97).
+
+Every variant begins with the fine-tuned policy of the experiment rlhf and learns from some of the comparisons that the reward model there
+has, in one epoch; a run's seed is that of both. A row stands for five steps; in some of them texts of the
+policy as it is then are looked at. At the end it is judged on prompts and on rated texts that it has not seen.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from course_lib import lm, preferences
+from course_lib.direct import Pairs, completion_logps, encode_pairs, like_lengths, reference_logps, train_step
+from course_lib.fine_tuning import Writer, Writing, openings
+from course_lib.judges import gold_judge
+from course_lib.reward_models import RewardModel, fit
+from course_lib.rlhf import whole_texts
+from experiments import rlhf
+from experiments.runner import Report, Result
+from solutions.ch96 import last_token_scores, reward_model_loss
+from solutions.ch97 import dpo_loss, ipo_loss, sequence_logps
+
+BETAS = (0.02, 0.05, 0.1, 0.3, 1.0)
+COMMON = {"pairs": 640, "batch": 16, "learning_rate": 2e-4, "loss": "dpo", "beta": 0.1}
+VARIANTS: dict[str, dict] = {
+    **{f"dpo_{beta:g}": COMMON | {"beta": beta} for beta in BETAS},
+    "dpo_0.1": COMMON | {"look": 10},
+    "smoothed": COMMON | {"label_smoothing": 0.2},
+    "ipo": COMMON | {"loss": "ipo"},
+    "unfrozen": COMMON | {"loss": "unfrozen", "beta": 1.0},
+    "suspect": COMMON | {"padding_counts": True, "look": 10},
+    "reward_model": COMMON | {"loss": "reward model"},
+}
+SEEDS = 5
+ROWS = 5  # steps that a row stands for
+FEW, MANY = 64, 192  # texts looked at on the way and at the end
+HELD_OUT = 64  # pairs of unseen texts, ordered by raters, that a program would log its accuracy on
+RATED = 300  # unseen texts with their mean ratings
+
+
+def dpo(beta: float, label_smoothing: float = 0.0):
+    return functools.partial(dpo_loss, beta=beta, label_smoothing=label_smoothing)
+
+
+def ipo(beta: float):
+    """ipo_loss with the implicit rewards that `train_step` logs."""
+    return lambda chosen, rejected, ref_chosen, ref_rejected: (
+        ipo_loss(chosen, rejected, ref_chosen, ref_rejected, beta),
+        *dpo_loss(chosen, rejected, ref_chosen, ref_rejected, beta)[1:],
+    )
+
+
+def unfrozen(beta: float):
+    """A reference that is the policy itself: whatever stands in for it is not looked at."""
+    return lambda chosen, rejected, *_: dpo_loss(chosen, rejected, chosen, rejected, beta)
+
+
+LOSSES = {"dpo": dpo, "ipo": ipo, "unfrozen": unfrozen}
+
+
+def batches(pairs: Pairs, size: int, padding_counts: bool, generator: torch.Generator | None = None) -> list[Pairs]:
+    """One epoch. The bug of the chapter's lab: every column behind the prompt counts, also the padding of that batch."""
+    parts = [pairs.of(rows) for rows in like_lengths(pairs, size, generator)]
+    if not padding_counts:
+        return parts
+    return [
+        part._replace(completion_mask=torch.arange(part.input_ids.shape[-1]).expand(part.input_ids.shape) >= 1) for part in parts
+    ]
+
+
+def reference(seed: int) -> lm.LanguageModel:
+    return rlhf.fine_tuned(seed)[0]
+
+
+def comparisons(count: int, seed: int) -> preferences.Preferences:
+    """The first of those that chapter 96's reward model of this seed is trained on."""
+    everything = preferences.comparisons(rlhf.COMPARISONS, seed)
+    names = ("chosen", "rejected", "disagreement", "gap")
+    return replace(everything, **{name: getattr(everything, name)[:count] for name in names})
+
+
+def encoded(model: lm.LanguageModel, asked: preferences.Preferences) -> Pairs:
+    return encode_pairs(model, asked.chosen_texts, asked.rejected_texts)
+
+
+@functools.cache
+def prepared(count: int, size: int, seed: int, padding_counts: bool) -> tuple[list[Pairs], list[torch.Tensor], float]:
+    """One epoch of a seed, the reference's log-probabilities of it, and the processor time that took: once for all variants."""
+    model = reference(seed)
+    begun = time.process_time()
+    epoch = batches(encoded(model, comparisons(count, seed)), size, padding_counts, torch.Generator().manual_seed(seed))
+    return epoch, answered(model, epoch), time.process_time() - begun
+
+
+@functools.cache
+def held_out(seed: int, padding_counts: bool) -> tuple[list[Pairs], torch.Tensor]:
+    """Pairs of unseen texts as a program would prepare them for its log, and the reference's log-probabilities (HELD_OUT, 2)."""
+    model = reference(seed)
+    parts = batches(encoded(model, preferences.comparisons(HELD_OUT, 1000 + seed, "test")), 16, padding_counts)
+    return parts, torch.cat(answered(model, parts))
+
+
+@functools.cache
+def rated(seed: int) -> tuple[Pairs, torch.Tensor]:
+    """RATED unseen texts, two by two, and what the reference says of them (RATED / 2, 2)."""
+    snippets, model = preferences.load("test"), reference(seed)
+    pairs = encode_pairs(model, snippets.texts[:RATED:2], snippets.texts[1:RATED:2])
+    return pairs, reference_logps(model, pairs, sequence_logps)
+
+
+@torch.no_grad()
+def answered(model: lm.LanguageModel, parts: list[Pairs]) -> list[torch.Tensor]:
+    """log π of both texts of each pair, (B, 2) for each batch."""
+    return [completion_logps(model, part, sequence_logps) for part in parts]
+
+
+def accuracy(scores: torch.Tensor) -> float:
+    """How often scores (RATED,) put two of the rated texts in the order of their mean ratings, over all pairs of them."""
+    return preferences.pairwise_accuracy(scores, preferences.load("test").means[:RATED]).estimate
+
+
+def written(policy: lm.LanguageModel, seed: int, texts: int) -> Writing:
+    """What the policy adds to prompts that it has not seen, and what the judge of chapter 96 gives for the whole texts."""
+    writer = Writer(policy, reference(seed), lambda samples: gold_judge()(whole_texts(policy, samples)), rlhf.TAUGHT)
+    return writer.write(openings("test")[:texts], rlhf.PPO.new_tokens, torch.Generator().manual_seed(10_000 + seed))
+
+
+@functools.cache
+def score_before(seed: int) -> float:
+    return written(reference(seed), seed, MANY).scores.mean().item()
+
+
+def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result:
+    """Train on one epoch of pairs, in some variants with a look at the policy's texts now and then; judge it at the end."""
+    choice: dict[str, Any] = VARIANTS[variant]
+    if choice["loss"] == "reward model":
+        return reward_model(choice, seed, report)
+    padding_counts = choice.get("padding_counts", False)
+    loss = LOSSES[choice["loss"]](**{key: choice[key] for key in ("beta", "label_smoothing") if key in choice})
+    policy = reference(seed).frozen_copy().requires_grad_(True)
+    epoch, ref, seconds = prepared(choice["pairs"], choice["batch"], seed, padding_counts)
+    unseen, unseen_ref = held_out(seed, padding_counts)
+    optimizer = torch.optim.AdamW(policy.parameters(), lr=choice["learning_rate"], weight_decay=0.0, fused=True)
+
+    def look() -> dict[str, float]:
+        moved = torch.cat(answered(policy, unseen)) - unseen_ref
+        return written(policy, seed, FEW).measured(rlhf.TAUGHT) | {"held_out": (moved[:, 0] > moved[:, 1]).float().mean().item()}
+
+    rows: list[dict] = []
+    steps: list[dict] = []
+    for done, (part, ref_logps) in enumerate(zip(epoch, ref, strict=True), 1):
+        begun = time.process_time()
+        steps.append(train_step(policy, optimizer, part, ref_logps, loss, sequence_logps))
+        seconds += time.process_time() - begun
+        if done % ROWS == 0:
+            row = {column: float(np.mean([step[column] for step in steps[-ROWS:]])) for column in steps[0]} | {"step": done}
+            rows.append(row | (look() if "look" in choice and done % choice["look"] == 0 else {}))
+            report(done, len(epoch))
+    writing = written(policy, seed, MANY)
+    pairs, ref_logps = rated(seed)
+    moved = reference_logps(policy, pairs, sequence_logps) - ref_logps
+    summary: dict[str, Any] = writing.measured(rlhf.TAUGHT) | {
+        "gold": writing.scores.mean().item(),
+        "gold_before": score_before(seed),
+        "vader": preferences.vader(writing.texts).mean().item(),
+        "seconds": seconds,
+        "rated_accuracy": accuracy(moved.flatten()),
+        "unseen_moved": moved.mean().item(),
+        **{column: float(np.mean([step[column] for step in steps[-2 * ROWS :]])) for column in steps[0]},
+        "texts": [{"prompt": prompt, "text": text} for prompt, text in zip(openings("test"), writing.texts[:8], strict=False)],
+    }
+    return Result(rows, summary)
+
+
+def reward_model(choice: dict, seed: int, report: Report) -> Result:
+    """Chapter 96's reward model, from the same comparisons as the other variants."""
+    begun = time.process_time()
+    asked = comparisons(choice["pairs"], seed)
+    model = fit(RewardModel(lm.load("tiny"), seed=seed), asked, reward_model_loss, last_token_scores, seed)
+    row = {"seconds": time.process_time() - begun}
+    row["rated_accuracy"] = accuracy(model.scores(preferences.load("test").texts[:RATED], last_token_scores))
+    return Result([row], row)
