@@ -42,12 +42,12 @@ class Taught:
 class MBPOSettings(sac.SACSettings):
     """Everything that one may choose, with defaults for Pendulum; `SACSettings` has the agent's."""
 
-    total_steps: int = 2_000  # environment steps
-    learning_starts: int = 400  # of these, with actions drawn evenly, before the first model
+    total_steps: int = 2_500  # environment steps
+    learning_starts: int = 200  # of these, with actions drawn evenly, before the first model
     batch_size: int = 128
     learning_rate: float = 1e-3
     hidden: int = 64
-    updates: int = 10  # of the agent, after each step
+    updates: int = 5  # of the agent, after each step
     horizon: int = 5  # steps of an imagined trajectory; 0: nothing is imagined, and all batches are real
     refresh_every: int = 100  # steps between two models, each of which goes on from the last
     refreshed: bool = True  # False: the first model is the last
@@ -170,11 +170,15 @@ class Ensemble:
     def _losses(self, inputs, targets):
         """Each member's own loss, (E,)."""
         means, log_vars = self.predict(inputs)
-        return torch.stack([self.gaussian_nll(mean[None], log_var[None], targets) for mean, log_var in zip(means, log_vars, strict=True)])
+        return torch.stack(
+            [self.gaussian_nll(mean[None], log_var[None], targets) for mean, log_var in zip(means, log_vars, strict=True)]
+        )
 
     def state_dict(self):
         """What `load_state_dict` needs to go on from here."""
-        return {"optimizer": self.optimizer.state_dict()} | {name: tensor.detach().clone() for name, tensor in self._tensors().items()}
+        return {"optimizer": self.optimizer.state_dict()} | {
+            name: tensor.detach().clone() for name, tensor in self._tensors().items()
+        }
 
     @torch.no_grad()
     def load_state_dict(self, state):
@@ -244,16 +248,22 @@ class Training(sac.Training):
         self.imagined.add(steps.obs, steps.actions, steps.rewards, steps.next_obs, steps.terminated)
 
     def batch(self):
-        """Imagined steps, with a few real ones among them."""
+        """Imagined steps, with a few real ones among them; without a model, real ones."""
         size = self.settings.batch_size
-        real = round(self.settings.real_fraction * size) if self.settings.horizon else size
+        if not self.settings.horizon:
+            return self.buffer.sample(size, self.generator)
+        real = round(self.settings.real_fraction * size)
         columns = self.buffer.sample(real, self.generator), self.imagined.sample(size - real, self.generator)
         return Transitions(*(torch.cat(pair) for pair in zip(*columns, strict=True)))
 
     def state_dict(self):
         """As `sac.Training.state_dict`, with the model and its dreams."""
         of_model = {name: value.item() for name, value in self.of_model.items()}
-        return super().state_dict() | {"model": self.model.state_dict(), "imagined": self.imagined.state_dict(), "of_model": of_model}
+        return super().state_dict() | {
+            "model": self.model.state_dict(),
+            "imagined": self.imagined.state_dict(),
+            "of_model": of_model,
+        }
 
     def load_state_dict(self, state):
         """Go on from `state_dict()`."""

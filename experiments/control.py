@@ -189,7 +189,20 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
     """Train one agent and evaluate it on the way."""
     algorithm, _, place = variant.partition("_")
     made: SACRun | PPORun = {"sac": SACRun, "ppo": PPORun}[algorithm](place, seed)
-    every, total = VARIANTS[variant]["every"], made.settings.total_steps
+    return followed(made, ENVIRONMENTS[place], VARIANTS[variant]["every"], CHUNK[algorithm], checkpoint_dir, report)
+
+
+def followed(
+    made,
+    environment: str,
+    every: int,
+    chunk: int,
+    checkpoint_dir: Path,
+    report: Report,
+    also: Callable[[], dict[str, float]] = dict,
+) -> Result:
+    """Train to the end what a class such as `SACRun` made, and evaluate it every so many steps; `also` adds to each row."""
+    total = made.settings.total_steps
     rows: list[dict[str, Any]] = []
     spent = {"train_seconds": 0.0, "train_cpu_seconds": 0.0}
     state = checkpoint.load(checkpoint_dir)
@@ -198,8 +211,8 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
         rows, spent = state["rows"], state["spent"]
 
     def play() -> dict[str, Any]:
-        returns = evaluate(made.best_action, ENVIRONMENTS[place])
-        return {"eval_return": float(np.mean(returns))} | {f"eval_return_{i}": value for i, value in enumerate(returns)}
+        returns = evaluate(made.best_action, environment)
+        return {"eval_return": float(np.mean(returns))} | {f"eval_return_{i}": value for i, value in enumerate(returns)} | also()
 
     if not rows:
         rows.append({"env_steps": 0} | spent | play())
@@ -207,7 +220,7 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
     while made.env_steps < total:
         due = len(rows) * every  # the steps of the next evaluation
         wall, cpu = time.perf_counter(), time.process_time()
-        told = made.advance(min(max(due - made.env_steps, 1), total - made.env_steps, CHUNK[algorithm]))
+        told = made.advance(min(max(due - made.env_steps, 1), total - made.env_steps, chunk))
         spent["train_seconds"] += time.perf_counter() - wall
         spent["train_cpu_seconds"] += time.process_time() - cpu
         if made.env_steps >= min(due, total):
@@ -216,5 +229,5 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
         if time.monotonic() - saved > SAVE_EVERY:
             checkpoint.save(checkpoint_dir, {"run": made.state_dict(), "rows": rows, "spent": spent})
             saved = time.monotonic()
-    final = evaluate(made.best_action, ENVIRONMENTS[place])
+    final = evaluate(made.best_action, environment)
     return Result(rows, {"final_returns": [round(value, 2) for value in final]} | spent)

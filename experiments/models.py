@@ -1,0 +1,111 @@
+"""Model-based policy optimisation on Pendulum and Walker2d: how long to dream, what a stale model costs, and how wrong models are.
+
+The protocol of evaluation is that of `control`, so that the records can be laid beside each other. Variants of `pendulum` change one
+setting each: how many steps a dream has (`h0`: no model at all, but as many updates, all on real steps), or that the first model is
+the last (`stale`). Each row also has what `model_error_by_horizon` finds on fresh trajectories of the policy as it is then:
+`error_1`, `error_2`, …, and for comparison `still_1`, …: the error of predicting that nothing moves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from course_lib import mbpo
+from course_lib.mbpo import MBPOSettings
+from experiments.control import ENVIRONMENTS, EPISODES, SACRun, followed
+from experiments.runner import Report, Result
+from solutions import ch48, ch51
+
+PENDULUM = MBPOSettings()
+SETTINGS = {
+    "pendulum": PENDULUM,
+    **{f"pendulum_h{horizon}": PENDULUM.but(horizon=horizon) for horizon in (0, 1, 20, 50)},
+    "pendulum_stale": PENDULUM.but(refreshed=False),
+    "walker2d": MBPOSettings(
+        total_steps=15_000,
+        learning_starts=2_000,
+        batch_size=256,
+        learning_rate=3e-4,
+        hidden=256,
+        updates=5,
+        horizon=1,
+        refresh_every=500,
+        imagined_steps=50_000,
+        imagined_size=100_000,
+        members=5,
+        model_hidden=200,
+        model_batch=256,
+    ),
+}
+EVERY = {"pendulum": 100, "walker2d": 1_000}  # environment steps between evaluations
+CHUNK = {"pendulum": 100, "walker2d": 50}  # steps between looks at the clock
+HORIZONS = (1, 2, 5, 10, 20, 50)
+TRAJECTORIES, TRAJECTORY_SEED = 20, 2_000_000
+
+
+def _place(variant: str) -> str:
+    return variant.partition("_")[0]
+
+
+def _configuration(variant: str, settings: MBPOSettings) -> dict[str, Any]:
+    about = {"algorithm": "mbpo", "environment": ENVIRONMENTS[_place(variant)], "evaluation_episodes": EPISODES}
+    return about | {"every": EVERY[_place(variant)]} | asdict(settings)
+
+
+VARIANTS = {variant: _configuration(variant, settings) for variant, settings in SETTINGS.items()}
+SEEDS = {variant: {"pendulum": 10, "walker2d": 3}.get(variant, 5) for variant in VARIANTS}
+
+
+class MBPORun(SACRun):
+    """Chapter 51's agent, as `control` advances its own."""
+
+    def __init__(self, variant: str, seed: int):
+        self.settings, self.environment = SETTINGS[variant], ENVIRONMENTS[_place(variant)]
+        taught = mbpo.Taught.of(vars(ch51) | vars(ch48))
+        self.training = mbpo.Training(gym.make(self.environment), self.settings, seed, taught, update=ch48.fast_sac_update)
+        self.best_action = self.training.agent.best_action
+
+    def model_errors(self) -> dict[str, float]:
+        """Errors by horizon, once there is a model and the policy stays on its feet for long enough."""
+        if not self.training.of_model:
+            return {}
+        generator = torch.Generator().manual_seed(TRAJECTORY_SEED)
+        obs, actions = trajectories(self.training.agent, self.environment, max(HORIZONS), generator)
+        if not obs.shape[1]:
+            return {}
+        errors = ch51.model_error_by_horizon(self.training.model, obs, actions, generator)
+        still = (obs[1:] - obs[0]).square().mean((1, 2)).sqrt()
+        return {f"{name}_{h}": column[h - 1].item() for h in HORIZONS for name, column in (("error", errors), ("still", still))}
+
+
+def trajectories(agent, environment: str, horizon: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    """First steps of episodes with a policy's random actions: obs (H + 1, B, O) and actions (H, B, A), of those that last so long."""
+    kept = []
+    for i in range(TRAJECTORIES):
+        env = gym.make(environment)
+        obs, actions = [env.reset(seed=TRAJECTORY_SEED + i)[0]], []
+        for _ in range(horizon):
+            actions.append(agent.act(obs[-1][None], generator)[0])
+            next_obs, _, terminated, _, _ = env.step(agent.scaled(actions[-1]).numpy())
+            if terminated:
+                break
+            obs.append(next_obs)
+        else:
+            kept.append((torch.as_tensor(np.array(obs), dtype=torch.float32), torch.stack(actions)))
+    if not kept:
+        return torch.zeros(horizon + 1, 0, 1), torch.zeros(horizon, 0, 1)
+    obs_of_all, actions_of_all = (torch.stack(columns, 1) for columns in zip(*kept, strict=True))
+    return obs_of_all, actions_of_all
+
+
+def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result:
+    """Train one agent and evaluate it and its model on the way."""
+    made = MBPORun(variant, seed)
+    place = _place(variant)
+    return followed(made, made.environment, EVERY[place], CHUNK[place], checkpoint_dir, report, made.model_errors)
