@@ -56,3 +56,14 @@ class LinearPolicy:
         self.calls += 1
         actions = obs @ self.gains.to(obs.dtype)
         return actions + self.noise * torch.randn(actions.shape, generator=generator, dtype=obs.dtype) if self.noise else actions
+
+
+@dataclass
+class FixedNetwork:
+    """A network that has learned something, long ago: tanh(inputs W), whose weights W are (inputs, outputs)."""
+
+    weights: torch.Tensor
+
+    def __call__(self, inputs):
+        """Outputs (B, outputs) for inputs (B, inputs)."""
+        return (inputs @ self.weights.to(inputs.dtype)).tanh()

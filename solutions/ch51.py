@@ -120,3 +120,29 @@ def model_error_by_horizon(model, obs, actions, generator):
             predicted, _, _ = model(predicted, taken, generator)
             errors.append((predicted - real).square().mean().sqrt())
     return torch.stack(errors)
+
+
+def repaired_next_obs(network, obs, actions, seen):
+    """Where the model of the suspect planner should have said that each step leads.
+
+    The network was trained on the steps `seen`: each component of their observations and
+    actions was brought to mean 0 and standard deviation 1, and so was each component of the
+    change of the observation, which it learned to predict.
+
+    Args:
+      network: takes (B, O + A), scaled observations with scaled actions behind them, and
+        gives scaled changes (B, O).
+      obs: (B, O), in units of observations.
+      actions: (B, A), in units of actions.
+      seen: dict of obs (N, O), actions (N, A) and next_obs (N, O), in the same units; N ≥ 2,
+        and no component is constant.
+
+    Returns: next_obs, (B, O), in units of observations. B may be 1.
+    Raises: ValueError if obs and actions have different batches.
+    """
+    if len(obs) != len(actions):
+        raise ValueError(f"obs and actions must have the same batch, got {len(obs)} and {len(actions)} rows")
+    learned_from = torch.cat([seen["obs"], seen["actions"]], -1)
+    changes = seen["next_obs"] - seen["obs"]
+    inputs = (torch.cat([obs, actions], -1) - learned_from.mean(0)) / learned_from.std(0)
+    return obs + changes.mean(0) + changes.std(0) * network(inputs)

@@ -898,4 +898,180 @@ MODEL_ERROR_BY_HORIZON = Exercise(
     },
 )
 
-EXERCISES = (GAUSSIAN_NLL, IMAGINE, DREAMER_LAMBDA_RETURNS, MODEL_ERROR_BY_HORIZON)
+# -------------------------------------------------------------------------------------------------------- repaired_next_obs
+
+_LAB = ("obs", "actions")
+
+
+def _planned(batch=5, seen=40, obs_dim=3, action_dim=2, spread=1.0):
+    """States to predict from, `spread` wide, and the steps that the network has seen, each component with a level and a scale of its own."""
+
+    def inputs(generator):
+        level, scale = 2 * normal(generator, obs_dim), 0.5 + 2 * uniform(generator, obs_dim)
+        obs, actions = level + scale * normal(generator, seen, obs_dim), 1 + 2 * normal(generator, seen, action_dim)
+        changes = normal(generator, obs_dim) + (0.3 + uniform(generator, obs_dim)) * normal(generator, seen, obs_dim)
+        return {
+            "network": built("dynamics.FixedNetwork", weights=0.7 * normal(generator, obs_dim + action_dim, obs_dim)),
+            "obs": level + scale * (normal(generator, obs_dim) + spread * normal(generator, batch, obs_dim)),
+            "actions": normal(generator, batch, action_dim),
+            "seen": {"obs": obs, "actions": actions, "next_obs": obs + changes},
+        }
+
+    return inputs
+
+
+def _moments(x, deviation=lambda x: x.std(0)):
+    return x.mean(0), deviation(x)
+
+
+def _predicted(
+    of_inputs=lambda inputs, seen: _moments(seen),
+    of_changes=lambda seen: _moments(seen["next_obs"] - seen["obs"]),
+    finish=lambda obs, change, level, scale: obs + level + scale * change,
+    checked=True,
+):
+    """A version of the repair: which moments scale the inputs, which the changes, and what is made of them."""
+
+    def version(network, obs, actions, seen):
+        if checked and obs.shape[0] != actions.shape[0]:
+            raise ValueError(f"obs {tuple(obs.shape)} and actions {tuple(actions.shape)} are not of the same steps")
+        inputs = torch.cat([obs, actions], 1)
+        level, scale = of_inputs(inputs, torch.cat([seen["obs"], seen["actions"]], 1))
+        return finish(obs, network((inputs - level) / scale), *of_changes(seen))
+
+    return version
+
+
+def _biased(x):
+    return _moments(x, lambda x: x.std(0, correction=0))
+
+
+def _observations_only(inputs, seen):
+    """The actions by their own batch."""
+    count = 3  # of observations, in every case
+    return tuple(torch.cat([of_seen[:count], own[count:]]) for of_seen, own in zip(_moments(seen), _moments(inputs), strict=True))
+
+
+def _row_at_a_time(network, obs, actions, seen):
+    if obs.shape[0] != actions.shape[0]:
+        raise ValueError(f"as many actions as obs are needed: {actions.shape[0]} and {obs.shape[0]}")
+    inputs = np.concatenate([seen["obs"].numpy(), seen["actions"].numpy()], 1)
+    changes = seen["next_obs"].numpy() - seen["obs"].numpy()
+    rows = []
+    for state, action in zip(obs.numpy(), actions.numpy(), strict=True):
+        scaled = (np.concatenate([state, action]) - inputs.mean(0)) / inputs.std(0, ddof=1)
+        change = network(torch.from_numpy(scaled[None]).to(obs.dtype))[0].numpy()
+        rows.append(torch.from_numpy(state + changes.mean(0) + changes.std(0, ddof=1) * change))
+    return torch.stack(rows).to(obs.dtype)
+
+
+def _among_the_seen(network, obs, actions, seen):
+    """Scale everything in one go."""
+    if len(obs) != len(actions):
+        raise ValueError(f"obs has {len(obs)} rows and actions {len(actions)}")
+    inputs, known = torch.cat([obs, actions], 1), torch.cat([seen["obs"], seen["actions"]], 1)
+    variance, level = torch.var_mean(known, 0)
+    spread, drift = torch.std_mean(seen["next_obs"] - seen["obs"], 0)
+    return torch.addcmul(obs + drift, spread, network((inputs - level) * variance.rsqrt()))
+
+
+REPAIRED_NEXT_OBS = Exercise(
+    name="repaired_next_obs",
+    reference=ch51.repaired_next_obs,
+    also_right=(_predicted(lambda inputs, seen: _biased(seen), lambda seen: _biased(seen["next_obs"] - seen["obs"])),),
+    criteria={"values": 1.7, "dtype": 0.1, "inputs": 0.1, "errors": 0.1},
+    axes=("step", "component"),
+    cases=(
+        Case("five states", _planned(), visible=True, draws=2),
+        Case("five states that are nearly alike", _planned(spread=0.05), visible=True, draws=2),
+        Case("a single state", _planned(1), visible=True),
+        Case("more states than were seen", _planned(30, 12)),
+        Case("single precision", _planned(), dtype=torch.float32, visible=True),
+        Case("actions of one step", reshaped(_planned(), "actions", lambda x: x[:1]), raises=_LAB, visible=True),
+        Case("obs without the last", reshaped(_planned(), "obs", lambda x: x[:-1]), raises=_LAB),
+    ),
+    misconceptions=(
+        Misconception(
+            "scaled-by-its-own-batch",
+            _predicted(lambda inputs, seen: _moments(inputs)),
+            "This is the suspect program's own bug. What does the network see of a state whose neighbours in the batch are the"
+            " same state?",
+        ),
+        Misconception(
+            "actions-scaled-by-their-own-batch",
+            _predicted(_observations_only),
+            "The actions are still scaled by the batch that they come in: a prediction must not depend on its neighbours.",
+        ),
+        Misconception(
+            "scaled-with-the-batch",
+            _predicted(lambda inputs, seen: _moments(torch.cat([seen, inputs]))),
+            "The batch has joined the steps that were seen: the scale must be the one that the network was trained with.",
+        ),
+        Misconception(
+            "not-scaled",
+            _predicted(lambda inputs, seen: (0.0, 1.0)),
+            "The network was trained on inputs of mean 0 and deviation 1: here it gets them in their own units.",
+        ),
+        Misconception(
+            "not-centred",
+            _predicted(lambda inputs, seen: (0.0, seen.std(0))),
+            "The inputs are divided by their scale, but the mean is not subtracted.",
+        ),
+        Misconception(
+            "divided-by-the-variance",
+            _predicted(lambda inputs, seen: _moments(seen, lambda x: x.var(0))),
+            "The inputs are divided by their variance: it is the standard deviation that brings them to 1.",
+        ),
+        Misconception(
+            "one-scale-for-all-components",
+            _predicted(lambda inputs, seen: (seen.mean(), seen.std())),
+            "One mean and one deviation for all components: each component has its own.",
+        ),
+        Misconception(
+            "change-taken-for-the-state",
+            _predicted(finish=lambda obs, change, level, scale: level + scale * change),
+            "This is the change: add it to the observation.",
+        ),
+        Misconception(
+            "change-left-scaled",
+            _predicted(finish=lambda obs, change, level, scale: obs + change),
+            "The network gives changes of mean 0 and deviation 1: bring them back to units of observations.",
+        ),
+        Misconception(
+            "mean-change-forgotten",
+            _predicted(finish=lambda obs, change, level, scale: obs + scale * change),
+            "The mean change was subtracted before training: add it again.",
+        ),
+        Misconception(
+            "mean-change-scaled-too",
+            _predicted(finish=lambda obs, change, level, scale: obs + scale * (level + change)),
+            "The mean change is in units of observations already: scale what the network gives, then add it.",
+        ),
+        Misconception(
+            "scale-of-the-next-observations",
+            _predicted(of_changes=lambda seen: _moments(seen["next_obs"])),
+            "The outputs are scaled back by the moments of next_obs: the network learned changes, next_obs - obs.",
+        ),
+        Misconception(
+            "scale-of-the-observations",
+            _predicted(of_changes=lambda seen: _moments(seen["obs"])),
+            "The outputs are scaled back by the moments of the observations: the network learned changes, next_obs - obs.",
+        ),
+        Misconception(
+            "change-the-wrong-way-round",
+            _predicted(of_changes=lambda seen: _moments(seen["obs"] - seen["next_obs"])),
+            "The change is what comes after minus what was before.",
+        ),
+        dtype_lost(ch51.repaired_next_obs),
+        in_place(ch51.repaired_next_obs, "obs", 1),
+        Misconception("bad-input-accepted", _predicted(checked=False), SHAPES),
+    ),
+    variants={
+        "biased deviations": _predicted(lambda inputs, seen: _biased(seen), lambda seen: _biased(seen["next_obs"] - seen["obs"])),
+        "moments passed along": _predicted(),
+        "a row at a time, in NumPy": _row_at_a_time,
+        "var_mean and addcmul": _among_the_seen,
+    },
+)
+
+EXERCISES = (GAUSSIAN_NLL, IMAGINE, DREAMER_LAMBDA_RETURNS, MODEL_ERROR_BY_HORIZON, REPAIRED_NEXT_OBS)
