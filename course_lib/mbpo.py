@@ -42,12 +42,14 @@ class Taught:
 class MBPOSettings(sac.SACSettings):
     """Everything that one may choose, with defaults for Pendulum; `SACSettings` has the agent's."""
 
-    total_steps: int = 2_500  # environment steps
+    total_steps: int = 1_500  # environment steps
     learning_starts: int = 200  # of these, with actions drawn evenly, before the first model
     batch_size: int = 128
     learning_rate: float = 1e-3
     hidden: int = 64
-    updates: int = 5  # of the agent, after each step
+    gamma: float = 0.95
+    tau: float = 0.01
+    updates: int = 10  # of the agent, after each step
     horizon: int = 5  # steps of an imagined trajectory; 0: nothing is imagined, and all batches are real
     refresh_every: int = 100  # steps between two models, each of which goes on from the last
     refreshed: bool = True  # False: the first model is the last
@@ -56,11 +58,11 @@ class MBPOSettings(sac.SACSettings):
     real_fraction: float = 0.05  # of each batch
     members: int = 5
     elites: int = 3  # members that are dreamt with
-    model_hidden: int = 64
+    model_hidden: int = 128
     model_batch: int = 64
-    model_learning_rate: float = 1e-3
+    model_learning_rate: float = 2e-3
     held_out: float = 0.2  # of the steps, to judge members on
-    patience: int = 3  # epochs without a better member, after which a model is finished
+    patience: int = 5  # epochs without a better member, after which a model is finished
 
 
 def never(next_obs):
