@@ -2,21 +2,24 @@
 
 The protocol of evaluation is that of `control`, so that the records can be laid beside each other. Variants of `pendulum` change one
 setting each: how many steps a dream has (`h0`: no model at all, but as many updates, all on real steps), or that the first model is
-the last (`stale`). Each row also has what `model_error_by_horizon` finds on fresh trajectories of the policy as it is then:
+the last (`stale`). `pendulum_film` is one run of `pendulum` and a video: a real trajectory beside what an early and the last model imagine. Each row also has what `model_error_by_horizon` finds on fresh trajectories of the policy as it is then:
 `error_1`, `error_2`, …, and for comparison `still_1`, …: the error of predicting that nothing moves.
 """
 
 from __future__ import annotations
 
+import copy
 from dataclasses import asdict
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
+from PIL import Image, ImageDraw
 
-from course_lib import mbpo
+from course_lib import mbpo, videos
 from course_lib.mbpo import MBPOSettings
 from experiments.control import ENVIRONMENTS, EPISODES, SACRun, followed
 from experiments.runner import Report, Result
@@ -27,6 +30,7 @@ SETTINGS = {
     "pendulum": PENDULUM,
     **{f"pendulum_h{horizon}": PENDULUM.but(horizon=horizon) for horizon in (0, 1, 20)},
     "pendulum_stale": PENDULUM.but(refreshed=False),
+    "pendulum_film": PENDULUM,
     "walker2d": MBPOSettings(
         total_steps=15_000,
         learning_starts=2_000,
@@ -61,7 +65,8 @@ def _configuration(variant: str, settings: MBPOSettings) -> dict[str, Any]:
 
 
 VARIANTS = {variant: _configuration(variant, settings) for variant, settings in SETTINGS.items()}
-SEEDS = {variant: {"pendulum": 10, "walker2d": 3}.get(variant, 5) for variant in VARIANTS}
+SEEDS = {variant: {"pendulum": 10, "walker2d": 3, "pendulum_film": 1}.get(variant, 5) for variant in VARIANTS}
+EARLY, FILMED_STEPS, SIZE = 300, 100, 200  # real steps of the early model; steps of the video; pixels of each of its panels
 
 
 class MBPORun(SACRun):
@@ -106,8 +111,56 @@ def trajectories(agent, environment: str, horizon: int, generator: torch.Generat
     return obs_of_all, actions_of_all
 
 
+def filmed(obs: list[torch.Tensor], names: tuple[str, ...]) -> np.ndarray:
+    """Pendulums side by side, drawn from their observations, (T, 3) each: frames (T, H, W, 3). A rod is as long as its cosine and
+    sine say."""
+    frames = []
+    for states in zip(*(panel.tolist() for panel in obs), strict=True):
+        image = Image.new("RGB", (SIZE * len(obs), SIZE), "white")
+        pen, middle = ImageDraw.Draw(image), SIZE // 2
+        for i, (name, (cosine, sine, _)) in enumerate(zip(names, states, strict=True)):
+            x = SIZE * i + middle
+            tip = x - 0.4 * SIZE * sine, middle - 0.4 * SIZE * cosine + 8
+            pen.line((x, middle + 8, *tip), fill="#2a7fbf" if i == 0 else "#d55e00", width=12)
+            pen.ellipse((x - 4, middle + 4, x + 4, middle + 12), fill="#222222")
+            pen.text((SIZE * i + 8, 6), name, fill="#222222", font_size=14)
+        frames.append(np.asarray(image))
+    return np.stack(frames)
+
+
+def _film(seed: int, report: Report) -> Result:
+    """A real trajectory of the last policy, and what two models imagine of it from its start and its actions."""
+    made = MBPORun("pendulum_film", seed)
+    made.advance(EARLY)
+    early = copy.deepcopy(made.training.model)
+    made.advance(made.settings.total_steps - EARLY)
+    report(made.env_steps, made.settings.total_steps)
+    env = gym.make(made.environment)
+    generator = torch.Generator().manual_seed(seed)
+    real, actions = [env.reset(seed=TRAJECTORY_SEED)[0]], []
+    for _ in range(FILMED_STEPS):
+        actions.append(made.training.agent.act(real[-1][None], generator))
+        real.append(env.step(made.training.agent.scaled(actions[-1])[0].numpy())[0])
+    start = torch.as_tensor(real[0])[None]
+    dreams = []
+    for model in (early, made.training.model):
+        upcoming = iter(actions)
+        dreams.append(ch51.imagine(model, lambda obs, generator, taken=upcoming: next(taken), start, FILMED_STEPS, generator))
+    columns = [torch.as_tensor(np.array(real)), *(dream["obs"][:, 0] for dream in dreams)]
+    frames = filmed(columns, ("real", f"model of {EARLY} steps", f"model of {made.settings.total_steps} steps"))
+    rows = [
+        {"env_steps": t}
+        | {name: (states[t] - columns[0][t]).norm().item() for name, states in zip(("early", "last"), columns[1:], strict=True)}
+        for t in range(FILMED_STEPS + 1)
+    ]
+    with TemporaryDirectory() as folder:
+        videos.save(frames, Path(folder) / "video.mp4", fps=20, width=3 * SIZE, poster=20)
+        return Result(rows, {}, {suffix: (Path(folder) / f"video.{suffix}").read_bytes() for suffix in ("mp4", "webp")})
+
+
 def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result:
-    """Train one agent and evaluate it and its model on the way."""
-    made = MBPORun(variant, seed)
-    place = _place(variant)
+    """Train one agent and evaluate it and its model on the way, or film them."""
+    if variant == "pendulum_film":
+        return _film(seed, report)
+    made, place = MBPORun(variant, seed), _place(variant)
     return followed(made, made.environment, EVERY[place], CHUNK[place], checkpoint_dir, report, made.model_errors)

@@ -904,7 +904,7 @@ _LAB = ("obs", "actions")
 
 
 def _planned(batch=5, seen=40, obs_dim=3, action_dim=2, spread=1.0):
-    """States to predict from, `spread` wide, and the steps that the network has seen, each component with a level and a scale of its own."""
+    """States to predict from, `spread` wide, and the steps that were seen; each component has a level and a scale of its own."""
 
     def inputs(generator):
         level, scale = 2 * normal(generator, obs_dim), 0.5 + 2 * uniform(generator, obs_dim)
