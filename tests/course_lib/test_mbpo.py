@@ -103,8 +103,8 @@ def test_a_step_of_the_model_comes_from_elites_only_and_its_generator_only():
     assert not any(column.requires_grad for column in first)
 
 
-def test_nothing_but_the_networks_own_weights_is_trained(monkeypatch):
-    made, before = training(), None
+def test_nothing_but_the_networks_own_weights_is_trained():
+    made = training()
     made.advance(30)
     before = [tensor.detach().clone() for tensor in made.agent.tensors()]
     made.model.fit(made.buffer[torch.arange(30)], made.generator)
