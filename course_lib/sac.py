@@ -16,7 +16,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -59,7 +59,7 @@ class SACSettings:
     target_entropy: float | None = None  # nats; None: minus the number of action components
     initial_alpha: float = 1.0
 
-    def but(self, **changes) -> SACSettings:
+    def but(self, **changes) -> Self:
         """These settings with some changed."""
         return replace(self, **changes)
 

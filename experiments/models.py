@@ -2,8 +2,9 @@
 
 The protocol of evaluation is that of `control`, so that the records can be laid beside each other. Variants of `pendulum` change one
 setting each: how many steps a dream has (`h0`: no model at all, but as many updates, all on real steps), or that the first model is
-the last (`stale`). `pendulum_film` is one run of `pendulum` and a video: a real trajectory beside what an early and the last model imagine. Each row also has what `model_error_by_horizon` finds on fresh trajectories of the policy as it is then:
-`error_1`, `error_2`, …, and for comparison `still_1`, …: the error of predicting that nothing moves.
+the last (`stale`). Each row also has what `model_error_by_horizon` finds on fresh trajectories of the policy as it is then:
+`error_1`, `error_2`, …, and for comparison `still_1`, …: the error of predicting that nothing moves. `pendulum_film` is one run of
+`pendulum` and a video: a real trajectory beside what an early and the last model imagine.
 """
 
 from __future__ import annotations
@@ -71,6 +72,8 @@ EARLY, FILMED_STEPS, SIZE = 300, 100, 200  # real steps of the early model; step
 
 class MBPORun(SACRun):
     """Chapter 51's agent, as `control` advances its own."""
+
+    training: mbpo.Training
 
     def __init__(self, variant: str, seed: int):
         self.settings, self.environment = SETTINGS[variant], ENVIRONMENTS[_place(variant)]

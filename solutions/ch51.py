@@ -53,16 +53,15 @@ def imagine(model, policy, start_obs, horizon, generator):
     Returns: dict of obs (H + 1, B, O), which begins with start_obs; actions (H, B, A),
       rewards (H, B), and continues (H, B).
     """
-    obs, actions, rewards, continues = [start_obs], [], [], []
+    dream: dict[str, list] = {"obs": [start_obs], "actions": [], "rewards": [], "continues": []}
     alive = torch.ones_like(start_obs[:, 0])
     for _ in range(horizon):
-        actions.append(policy(obs[-1], generator))
-        next_obs, reward, goes_on = model(obs[-1], actions[-1], generator)
+        actions = policy(dream["obs"][-1], generator)
+        next_obs, rewards, goes_on = model(dream["obs"][-1], actions, generator)
         alive = alive * goes_on
-        for column, entry in zip((obs, rewards, continues), (next_obs, reward, alive), strict=True):
-            column.append(entry)
-    columns = {"obs": obs, "actions": actions, "rewards": rewards, "continues": continues}
-    return {name: torch.stack(column) for name, column in columns.items()}
+        for name, entry in {"obs": next_obs, "actions": actions, "rewards": rewards, "continues": alive}.items():
+            dream[name].append(entry)
+    return {name: torch.stack(column) for name, column in dream.items()}
 
 
 def dreamer_lambda_returns(rewards, values, continues, gamma, lam):

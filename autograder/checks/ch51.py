@@ -537,7 +537,8 @@ def _backwards(mix, last=lambda v: v[-1]):
     """A recursion: `mix` takes r, v, c, what follows, gamma, lam of one step."""
 
     def formula(r, v, c, gamma, lam):
-        following, found = last(v), []
+        following = last(v)
+        found: list[torch.Tensor] = []
         for t in reversed(range(min(len(r), len(v), len(c)))):
             following = mix(r[t], v[t], c[t], following, gamma, lam)
             found.insert(0, following)
