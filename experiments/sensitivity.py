@@ -41,7 +41,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "sac_learning_rate_0.03": {"learning_rate": 3e-2},
     "sac_gamma_0.9": {"gamma": 0.9},
     "sac_gamma_0.99": {"gamma": 0.99},
-    "sac_target_entropy_-4": {"target_entropy": -4.0},
+    "sac_target_entropy_minus_4": {"target_entropy": -4.0},
     "sac_target_entropy_0.5": {"target_entropy": 0.5},
     "ppo": {},
     "ppo_learning_rate_0.0001": {"learning_rate": 1e-4},
