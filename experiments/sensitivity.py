@@ -1,7 +1,7 @@
 """SAC and PPO on Pendulum: three values of three hyper-parameters for each, and the program of chapter 48's bug lab.
 
 A variant is `sac` or `ppo`, or one of them with one setting changed, such as `sac_learning_rate_0.03`; `lab_suspect` is the lab's
-program before its repair (after it, it is `sac`). Runs take seconds, so that there are more seeds of the two unchanged settings than
+program before its repair (after it, it is `sac`), and `lab_symmetric` has the same fault and a motor of symmetric bounds. Runs take seconds, so that there are more seeds of the two unchanged settings than
 elsewhere. Policies are evaluated as in experiments/control.py; evaluation is not in the processor time that the rows tell.
 """
 
@@ -51,6 +51,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "ppo_clip_range_0.05": {"clip_range": 0.05},
     "ppo_clip_range_0.8": {"clip_range": 0.8},
     "lab_suspect": {},
+    "lab_symmetric": {},
 }
 SETTINGS: dict[str, Any] = {
     variant: (PPO if variant.startswith("ppo") else SAC).but(**changes) for variant, changes in CHANGES.items()
@@ -64,9 +65,19 @@ VARIANTS = {
 SEEDS = {variant: {"sac": 20, "ppo": 10}.get(variant, 5) for variant in VARIANTS}
 
 
-def suspect_update(agent, batch, settings, taught, generator):
-    """An update from a buffer of commands in [0, 1], as the lab's motor is sent them, and not of actions in (-1, 1)."""
-    return ch48.fast_sac_update(agent, batch._replace(actions=0.5 * (batch.actions + 1)), settings, taught, generator)
+KEPT = {"lab_suspect": lambda actions: 0.5 * (actions + 1), "lab_symmetric": lambda actions: 2 * actions}
+"""What the lab's buffers hold in place of actions in (-1, 1): commands in [0, 1], or torques in [-2, 2]."""
+
+
+def updating(variant: str) -> Callable:
+    """The update of a variant of SAC; the lab's learns from actions in the units of its motor."""
+    if variant not in KEPT:
+        return ch48.fast_sac_update
+
+    def update(agent, batch, settings, taught, generator):
+        return ch48.fast_sac_update(agent, batch._replace(actions=KEPT[variant](batch.actions)), settings, taught, generator)
+
+    return update
 
 
 def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result:
@@ -92,8 +103,7 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
 
         ch45.train_ppo(world, settings, seed, policy, log=every_other, update=ch45.fast_ppo_update)
     else:
-        update = suspect_update if variant == "lab_suspect" else ch48.fast_sac_update
-        training = sac.Training(gym.make(ENVIRONMENT), settings, seed, sac.Taught.of(vars(ch48)), update)
+        training = sac.Training(gym.make(ENVIRONMENT), settings, seed, sac.Taught.of(vars(ch48)), updating(variant))
         while training.env_steps < settings.total_steps:
             log(training.advance(EVERY["sac"]), training.agent.best_action)
     return Result(rows, {"final_return": rows[-1]["eval_return"]})
