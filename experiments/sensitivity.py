@@ -1,8 +1,9 @@
 """SAC and PPO on Pendulum: three values of three hyper-parameters for each, and the program of chapter 48's bug lab.
 
 A variant is `sac` or `ppo`, or one of them with one setting changed, such as `sac_learning_rate_0.03`; `lab_suspect` is the lab's
-program before its repair (after it, it is `sac`), and `lab_symmetric` has the same fault and a motor of symmetric bounds. Runs take seconds, so that there are more seeds of the two unchanged settings than
-elsewhere. Policies are evaluated as in experiments/control.py; evaluation is not in the processor time that the rows tell.
+program before its repair (after it, it is `sac`), and `lab_symmetric` has the same fault and a motor of symmetric bounds. Runs take
+seconds, so that there are more seeds of the two unchanged settings than elsewhere. Policies are evaluated as in experiments/control.py;
+evaluation is not in the processor time that the rows tell.
 """
 
 from __future__ import annotations
