@@ -49,7 +49,8 @@ class ReplayBuffer:
         count = len(obs)
         if count > len(self.rows):
             raise ValueError(f"obs must have at most {len(self.rows)} rows, the buffer's capacity, got {count}")
-        columns = obs, actions, np.reshape(rewards, (count, 1)), next_obs, np.reshape(terminated, (count, 1))
+        rewards, terminated = (np.asarray(column).reshape(count, 1) for column in (rewards, terminated))
+        columns = obs, actions, rewards, next_obs, terminated
         places = np.arange(self.added, self.added + count) % len(self.rows)
         self.rows.numpy()[places] = np.concatenate(columns, axis=1)
         self.added += count

@@ -71,7 +71,7 @@ CHUNK = {"sac": 500, "ppo": 1}  # steps between looks at the clock; PPO's least 
 
 
 def _configuration(algorithm: str, place: str) -> dict[str, Any]:
-    settings: Any = {"sac": SAC_SETTINGS, "ppo": PPO_SETTINGS}[algorithm][place]
+    settings: Any = SAC_SETTINGS[place] if algorithm == "sac" else PPO_SETTINGS[place]
     chosen = {name: "infinity" if value == math.inf else value for name, value in asdict(settings).items()}
     about = {"algorithm": algorithm, "environment": ENVIRONMENTS[place], "evaluation_episodes": EPISODES}
     every = EVERY[algorithm].get(place, DEFAULT_EVERY[algorithm])
@@ -173,7 +173,7 @@ def evaluate(best_action: Callable, environment: str, episodes: int = EPISODES, 
     obs = np.stack([stage.reset(seed=seed + i)[0] for i, stage in enumerate(stages)])
     returns, playing = np.zeros(episodes), list(range(episodes))
     while playing:
-        space = stages[0].action_space
+        space: Any = stages[0].action_space
         actions = best_action(obs[playing].astype(np.float32)).numpy().clip(space.low, space.high)
         ended = []
         for i, action in zip(playing, actions, strict=True):
@@ -188,7 +188,7 @@ def evaluate(best_action: Callable, environment: str, episodes: int = EPISODES, 
 def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result:
     """Train one agent and evaluate it on the way."""
     algorithm, _, place = variant.partition("_")
-    made: SACRun | PPORun = {"sac": SACRun, "ppo": PPORun}[algorithm](place, seed)
+    made: SACRun | PPORun = SACRun(place, seed) if algorithm == "sac" else PPORun(place, seed)
     return followed(made, ENVIRONMENTS[place], VARIANTS[variant]["every"], CHUNK[algorithm], checkpoint_dir, report)
 
 

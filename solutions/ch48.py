@@ -9,6 +9,7 @@ import torch
 from torch.nn import functional
 
 from course_lib import validate
+from course_lib.replay import Transitions
 
 
 def squashed_gaussian_log_prob(mean, log_std, pre_tanh_actions):
@@ -170,6 +171,36 @@ def bootstrap_interval(scores, confidence=0.95, num_resamples=2000, generator=No
     means = torch.vmap(interquartile_mean)(resampled)
     tail = (1 - confidence) / 2
     return means.quantile(tail), means.quantile(1 - tail)
+
+
+def repaired_transitions(obs, sent, rewards, next_obs, terminated, truncated, low, high):
+    """What the suspect program of the bug lab should have put into its replay buffer.
+
+    Args:
+      obs: what the policy saw; (N, O).
+      sent: what the environment was sent, in its own units; (N, A).
+      rewards: (N,).
+      next_obs: the true successor, also where an episode ended; (N, O).
+      terminated: whether the task ended with the step; (N,) bool.
+      truncated: whether a time limit cut the episode off; (N,) bool.
+      low, high: the bounds of what the environment takes, low < high; (A,).
+
+    Returns: Transitions of N steps, as the update of SAC needs them.
+    Raises: ValueError if the numbers of rows differ, or low < high does not hold everywhere.
+    """
+    for name, rows in {
+        "sent": sent,
+        "rewards": rewards,
+        "next_obs": next_obs,
+        "terminated": terminated,
+        "truncated": truncated,
+    }.items():
+        if len(rows) != len(obs):
+            raise ValueError(f"{name} must have as many rows as obs, {len(obs)}, got {len(rows)}")
+    if not (low < high).all():
+        raise ValueError(f"low must lie below high in every component, got {low.tolist()} and {high.tolist()}")
+    middle, reach = (low + high) / 2, (high - low) / 2
+    return Transitions(obs, (sent - middle) / reach, rewards, next_obs, terminated)
 
 
 def fast_sac_update(agent, batch, settings, taught, generator):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,6 +28,7 @@ from autograder.mistakes import (
 )
 from autograder.spec import Case, Exercise, Misconception
 from course_lib.cases import built
+from course_lib.replay import Transitions
 from solutions import ch48
 
 HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
@@ -1013,10 +1015,10 @@ def _cumulated(scores):
 HALVES = (0, 0, 0, 0, 1, 1, 1, 1)
 FEW = (0, 0, 1, 1)
 LUCKY = (0, 0, 0, 1)
-_SPARE = {"rtol": 1e-4, "atol": 1e-4}
+_SPARE: dict[str, Any] = {"rtol": 1e-4, "atol": 1e-4}
 
 
-def _pattern(*columns, confidence=0.5, num_resamples=600):
+def _pattern(*columns, confidence=0.5, num_resamples=400):
     """Few distinct scores, in random order and units. Their resampled means are few, too, and the ends of the interval fall on
     them: then every right bootstrap gives the same numbers but for one draw in millions."""
 
@@ -1105,16 +1107,14 @@ def _task_means(by_task, count, generator):
     return torch.stack(columns, 1).mean(1, keepdim=True)
 
 
-def _by_counts(by_task, count, generator):
-    """How often each seed is drawn, by a multinomial, and the scores repeated so often."""
-    rows = []
-    for _ in range(count):
-        columns = [
-            column[torch.multinomial(torch.ones(len(column)), len(column), replacement=True, generator=generator)]
-            for column in by_task.unbind(1)
-        ]
-        rows.append(torch.cat(columns))
-    return torch.stack(rows)
+def _by_multinomial(by_task, count, generator):
+    """Seeds as the outcomes of a multinomial with equal weights."""
+    size = len(by_task)
+    columns = [
+        column[torch.multinomial(torch.ones(count, size), size, replacement=True, generator=generator)]
+        for column in by_task.unbind(1)
+    ]
+    return torch.cat(columns, 1)
 
 
 def _by_floor(by_task, count, generator):
@@ -1124,16 +1124,15 @@ def _by_floor(by_task, count, generator):
     return torch.cat([by_task[picks[:, :, task], task] for task in range(tasks)], 1)
 
 
-def _by_loop(scores, confidence=0.95, num_resamples=2000, generator=None):
+def _task_by_task(scores, confidence=0.95, num_resamples=2000, generator=None):
+    """Each score four times over, so that a quarter can be cut off; the interval's ends by counting."""
     by_task = scores.reshape(len(scores), -1)
-    size, tasks = by_task.shape
-    means = []
-    for _ in range(num_resamples):
-        picks = torch.randint(0, size, (size, tasks), generator=generator)
-        means.append(_four_of_each(torch.gather(by_task, 0, picks)))
-    ordered = torch.stack(means).sort().values
+    drawn = [column[torch.randint(len(column), (num_resamples, len(column)), generator=generator)] for column in by_task.T]
+    ordered = torch.cat(drawn, 1).repeat_interleave(4, 1).sort(1).values
+    quarter = ordered.shape[1] // 4
+    means = ordered[:, quarter : 3 * quarter].mean(1).sort().values
     tail = (1 - confidence) / 2
-    return ordered[int(tail * num_resamples)], ordered[int((1 - tail) * num_resamples) - 1]
+    return means[int(tail * num_resamples)], means[int((1 - tail) * num_resamples) - 1]
 
 
 def _in_numpy_by_seed(scores, confidence=0.95, num_resamples=2000, generator=None):
@@ -1162,12 +1161,10 @@ BOOTSTRAP_INTERVAL = Exercise(
     reference=ch48.bootstrap_interval,
     criteria={"values": 1.3, "dtype": 0.1, "inputs": 0.1},
     cases=drawn_once(
-        Case("eight seeds, half of them failed", _pattern(HALVES), visible=True, draws=2, **_SPARE),
-        Case("four seeds, one of them lucky", _pattern(LUCKY, confidence=0.7), visible=True, draws=2, **_SPARE),
+        Case("eight seeds, half of them failed", _pattern(HALVES), visible=True, **_SPARE),
+        Case("four seeds, one of them lucky", _pattern(LUCKY, confidence=0.7), visible=True, **_SPARE),
         Case("confidence 0.9", _pattern(HALVES, confidence=0.9, num_resamples=1000), **_SPARE),
-        Case(
-            "two tasks", _pattern(FEW, [score + 10 for score in FEW], confidence=0.7, num_resamples=700), visible=True, **_SPARE
-        ),
+        Case("two tasks", _pattern(FEW, [score + 10 for score in FEW], confidence=0.7), visible=True, **_SPARE),
         Case("two tasks in which seeds trade places", _together, visible=True, draws=2, **_SPARE),
         Case("three tasks, all seeds alike: no width", _levels, closed_form=_certain, visible=True, **_SPARE),
         Case("a single seed: no width", _pattern((3,)), closed_form=_certain, **_SPARE),
@@ -1272,9 +1269,170 @@ BOOTSTRAP_INTERVAL = Exercise(
     variants={
         "all resamples at once": _bootstrap(),
         "rounded uniform numbers": _bootstrap(draw=_by_floor),
-        "resample by resample": _by_loop,
-        "multinomial": _bootstrap(draw=_by_counts),
+        "task by task": _task_by_task,
+        "multinomial": _bootstrap(draw=_by_multinomial),
         "NumPy, seeded from the generator": _in_numpy_by_seed,
+    },
+)
+
+# --------------------------------------------------------------------------------------------------- repaired_transitions
+
+_ROWS = ("sent", "rewards", "truncated")
+
+
+def _motor_steps(size=6, dims=2, low=(-1.0, 0.5), high=(3.0, 1.5), reach=1.0):
+    """Steps of motors whose commands lie within `reach` of their range around its middle."""
+
+    def inputs(generator):
+        lower, upper = torch.tensor(low, dtype=torch.float64), torch.tensor(high, dtype=torch.float64)
+        ends = uniform(generator, 2, size) < 0.5
+        ends[:, 0], ends[:, -1] = torch.tensor([True, False]), torch.tensor([False, True])
+        return {
+            "obs": normal(generator, size, 3),
+            "sent": 0.5 * (lower + upper) + reach * (uniform(generator, size, dims) - 0.5) * (upper - lower),
+            "rewards": normal(generator, size),
+            "next_obs": normal(generator, size, 3),
+            "terminated": ends[0],
+            "truncated": ends[1],
+            "low": lower,
+            "high": upper,
+        }
+
+    return inputs
+
+
+def _kept(actions=None, ended=lambda terminated, truncated: terminated, checked=True, **columns):
+    """A version: `actions(sent, low, high)` are those that are kept."""
+
+    def version(obs, sent, rewards, next_obs, terminated, truncated, low, high):
+        if checked:
+            for name, rows in {"sent": sent, "rewards": rewards, "next_obs": next_obs, "terminated": terminated}.items():
+                if rows.shape[0] != obs.shape[0]:
+                    raise ValueError(f"{name} has {rows.shape[0]} rows, obs {obs.shape[0]}")
+            if truncated.shape != terminated.shape:
+                raise ValueError(f"truncated is {tuple(truncated.shape)}, terminated {tuple(terminated.shape)}")
+            if (high <= low).any():
+                raise ValueError(f"low must lie below high, got {low} and {high}")
+        kept = Transitions(obs, (actions or _as_sampled)(sent, low, high), rewards, next_obs, ended(terminated, truncated))
+        return kept._replace(**{name: change(kept) for name, change in columns.items()})
+
+    return version
+
+
+def _as_sampled(sent, low, high):
+    return 2 * (sent - low) / (high - low) - 1
+
+
+def _component_by_component(sent, low, high):
+    columns = [(sent[:, i] - (low[i] + high[i]) / 2) / ((high[i] - low[i]) / 2) for i in range(sent.shape[1])]
+    return torch.stack(columns, 1)
+
+
+def _by_interpolation(sent, low, high):
+    ends = np.array([-1.0, 1.0])
+    columns = [np.interp(sent[:, i].numpy(), [float(low[i]), float(high[i])], ends) for i in range(sent.shape[1])]
+    return torch.from_numpy(np.stack(columns, 1)).to(sent.dtype)
+
+
+REPAIRED_TRANSITIONS = Exercise(
+    name="repaired_transitions",
+    reference=ch48.repaired_transitions,
+    criteria={"values": 1.6, "dtype": 0.1, "inputs": 0.1, "errors": 0.2},
+    axes=("step",),
+    cases=drawn_once(
+        Case("a motor that takes 0 to 1", _motor_steps(dims=1, low=(0.0,), high=(1.0,)), visible=True, draws=2),
+        Case("two motors with bounds of their own", _motor_steps(), visible=True, draws=2),
+        Case("bounds of -1 and 1", _motor_steps(low=(-1.0, -1.0), high=(1.0, 1.0)), visible=True),
+        Case("symmetric bounds", _motor_steps(dims=1, low=(-2.0,), high=(2.0,))),
+        Case("as many steps as motors", _motor_steps(size=2)),
+        Case("single precision", _motor_steps(), dtype=torch.float32, visible=True),
+        Case(
+            "low above high", replaced(_motor_steps(), low=torch.full((2,), 5.0)), raises=["low", "high"], visible=True, draws=1
+        ),
+        *shape_cases(_motor_steps(), _ROWS),
+    ),
+    misconceptions=(
+        Misconception(
+            "as-sent",
+            _kept(lambda sent, low, high: sent.clone()),
+            "The buffer keeps what the environment was sent. The policy's actions lie in (-1, 1), and the critic is asked about those: it"
+            " has to be taught about actions on the same scale.",
+        ),
+        Misconception(
+            "as-clipped",
+            _kept(lambda sent, low, high: sent.clamp(-1, 1)),
+            "Clipping commands to [-1, 1] makes many of them one and the same action, and moves none to where the policy meant it:"
+            " undo the scaling.",
+        ),
+        Misconception(
+            "to-the-unit-interval",
+            _kept(lambda sent, low, high: (sent - low) / (high - low)),
+            "These actions lie in [0, 1]: half of the range that the policy chooses from is missing.",
+        ),
+        Misconception(
+            "divided-by-the-upper-bound",
+            _kept(lambda sent, low, high: sent / high),
+            "Dividing by the upper bound is right only for bounds that are symmetric around 0.",
+        ),
+        Misconception(
+            "not-centred",
+            _kept(lambda sent, low, high: 2 * sent / (high - low)),
+            "The middle of the motor's range is the policy's 0: subtract it before you scale.",
+        ),
+        Misconception(
+            "not-scaled",
+            _kept(lambda sent, low, high: sent - 0.5 * (low + high)),
+            "The commands are centred, but not scaled: half of the range is 1.",
+        ),
+        Misconception(
+            "half-the-scale",
+            _kept(lambda sent, low, high: (sent - 0.5 * (low + high)) / (high - low)),
+            "Divide by half of the range: these actions reach only from -0.5 to 0.5.",
+        ),
+        Misconception(
+            "upside-down",
+            _kept(lambda sent, low, high: 1 - 2 * (sent - low) / (high - low)),
+            "The lower bound is the policy's -1, the upper one its 1: these are exchanged.",
+        ),
+        Misconception(
+            "one-motor's-bounds-for-all",
+            _kept(lambda sent, low, high: 2 * (sent - low[0]) / (high[0] - low[0]) - 1),
+            "Every motor has bounds of its own: low and high are (A,), and broadcast over the steps.",
+        ),
+        Misconception(
+            "before-squashing",
+            _kept(lambda sent, low, high: _as_sampled(sent, low, high).clamp(-1 + 1e-6, 1 - 1e-6).atanh()),
+            "The critic is asked about actions after the hyperbolic tangent, in (-1, 1), not about pre-activations.",
+        ),
+        Misconception(
+            "truncated-taken-for-terminated",
+            _kept(ended=lambda terminated, truncated: terminated | truncated),
+            "A time limit is no end of the task: the critic's target goes on there.",
+        ),
+        Misconception(
+            "truncated-instead-of-terminated",
+            _kept(ended=lambda terminated, truncated: truncated),
+            "`terminated` is what ends the target. The time limit does not.",
+        ),
+        Misconception(
+            "successor-lost",
+            _kept(next_obs=lambda kept: kept.obs),
+            "next_obs is what the step led to, not what was seen before it.",
+        ),
+        Misconception(
+            "dtype-lost",
+            after(ch48.repaired_transitions, lambda kept: kept._replace(actions=kept.actions.half())),
+            "The actions have lost the dtype of what was sent.",
+        ),
+        in_place(ch48.repaired_transitions, "sent", 1),
+        Misconception("bad-input-accepted", _kept(checked=False), SHAPES),
+    ),
+    variants={
+        "from the lower bound": _kept(),
+        "component by component": _kept(_component_by_component),
+        "interpolation": _kept(_by_interpolation),
+        "from the upper bound": _kept(lambda sent, low, high: 1 - (high - sent) / ((high - low) / 2)),
+        "a plain tuple": after(_kept(), tuple),
     },
 )
 
@@ -1286,4 +1444,5 @@ EXERCISES = (
     POLYAK_UPDATE,
     INTERQUARTILE_MEAN,
     BOOTSTRAP_INTERVAL,
+    REPAIRED_TRANSITIONS,
 )
