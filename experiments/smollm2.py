@@ -27,7 +27,7 @@ from solutions.ch97 import dpo_loss, sequence_logps
 MODEL = "smollm2-135m"
 VARIANTS: dict[str, dict] = {
     "ppo": {
-        "last_layers": 6, "kl_coef": 0.02, "iterations": 30, "batch": 32, "new_tokens": 16, "minibatch": 16, "learning_rate": 4e-4,
+        "last_layers": 6, "kl_coef": 0.02, "iterations": 30, "batch": 24, "new_tokens": 16, "minibatch": 12, "learning_rate": 4e-4,
         "gae_lambda": 1.0,
     },
     "dpo": {"last_layers": 6, "beta": 0.1, "steps": 20, "batch": 8, "learning_rate": 2e-4},
