@@ -454,6 +454,11 @@ DPO_LOSS = Exercise(
             "beta is not used in the losses: x = beta * (chosen log-ratio - rejected log-ratio).",
         ),
         Misconception(
+            "beta-nowhere",
+            _dpo(loss=lambda gap, beta, s: _smoothed(gap, s), reward=lambda a, b, beta: a - b),
+            "beta is not used at all: it multiplies the gap in the losses, and the log-ratios in the rewards.",
+        ),
+        Misconception(
             "beta-outside",
             _dpo(loss=lambda gap, beta, s: beta * _smoothed(gap, s)),
             "beta scales the loss, which only rescales the learning rate: it belongs inside the sigmoid.",
