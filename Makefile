@@ -1,6 +1,6 @@
 # make book    build book/_build/html/index.html          make test   all tests (installs Chromium and bubblewrap if it may)
 # make release write the students' bundle into release/   make check  style, types and the quick tests
-# make bench   how fast are the grader, beside stock nbgrader, PPO, beside Stable-Baselines3, and DPO, beside TRL (installs both)
+# make bench   how fast are the grader, beside stock nbgrader, PPO and SAC, beside Stable-Baselines3, and DPO, beside TRL (installs both)
 # The environment is .venv; it is brought up to date whenever the pins or pyproject.toml change.
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
@@ -33,6 +33,7 @@ bench: install
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[bench]'
 	$(BIN)/python tools/bench_grading.py
 	$(BIN)/python tools/bench_ppo.py
+	$(BIN)/python tools/bench_sac.py
 	$(BIN)/python tools/bench_dpo.py
 
 install: $(INSTALLED)

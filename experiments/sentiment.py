@@ -21,6 +21,7 @@ from solutions import ch45, ch95
 BASE = {"kl_coef": 0.01, "iterations": 24, "learning_rate": 6e-4}
 VARIANTS: dict[str, dict[str, Any]] = {
     **{f"kl_{kl_coef}": BASE | {"kl_coef": kl_coef} for kl_coef in (0.0, 0.01, 0.05, 0.2)},
+    "kl_0.0_long": BASE | {"kl_coef": 0.0, "iterations": 80},
     "patient": BASE | {"iterations": 50, "learning_rate": 2e-4, "gae_lambda": 1.0},
     "lab_suspect": BASE | {"rewards": "whitened"},
     "lab_repaired": BASE | {"rewards": "scaled"},

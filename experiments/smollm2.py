@@ -27,7 +27,8 @@ from solutions.ch97 import dpo_loss, sequence_logps
 MODEL = "smollm2-135m"
 VARIANTS: dict[str, dict] = {
     "ppo": {
-        "last_layers": 6, "kl_coef": 0.05, "iterations": 12, "batch": 16, "new_tokens": 16, "minibatch": 8, "learning_rate": 2e-4,
+        "last_layers": 6, "kl_coef": 0.02, "iterations": 30, "batch": 24, "new_tokens": 16, "minibatch": 12, "learning_rate": 4e-4,
+        "gae_lambda": 1.0,
     },
     "dpo": {"last_layers": 6, "beta": 0.1, "steps": 20, "batch": 8, "learning_rate": 2e-4},
     "reward_model": {"last_layers": 0, "texts": 600, "steps": 150, "batch": 64, "learning_rate": 1e-3},

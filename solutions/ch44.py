@@ -12,7 +12,7 @@ def td_residuals(rewards, values, next_values, terminated, gamma=0.99):
 
         δ_t = r_t + γ (1 - terminated_t) V(s_{t+1}) - V(s_t)
 
-    Schulman et al. (2016), eq. 9, https://arxiv.org/abs/1506.02438
+    Schulman et al. (2016), section 3, https://arxiv.org/abs/1506.02438
 
     Args:
       rewards: r_t, in units of reward; (T, N).

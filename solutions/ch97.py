@@ -123,16 +123,16 @@ def kl_optimal_policy(ref_probs, rewards, beta):
     return (ref_probs.log() + rewards / beta).softmax(-1)
 
 
-def repaired_completion_mask(attention_mask, prompt_lengths):
+def repaired_completion_mask(attention_mask, prompt_tokens):
     """Which tokens of each text the suspect program of the bug lab should have counted.
 
     Args:
       attention_mask: True at a text's own tokens, prompt and end token included, False at
         padding on either side; (B, L) bool.
-      prompt_lengths: how many of a text's own tokens are its prompt; (B,) int64.
+      prompt_tokens: how many of a text's own tokens are its prompt; (B,) int64.
 
     Returns: (B, L) bool, True at the tokens that the policy would have to write.
     Raises: ValueError if the numbers of rows differ.
     """
-    validate.same_length(attention_mask=attention_mask, prompt_lengths=prompt_lengths)
-    return attention_mask & (attention_mask.cumsum(1) > prompt_lengths[:, None])
+    validate.same_length(attention_mask=attention_mask, prompt_tokens=prompt_tokens)
+    return attention_mask & (attention_mask.cumsum(1) > prompt_tokens[:, None])

@@ -454,6 +454,11 @@ DPO_LOSS = Exercise(
             "beta is not used in the losses: x = beta * (chosen log-ratio - rejected log-ratio).",
         ),
         Misconception(
+            "beta-nowhere",
+            _dpo(loss=lambda gap, beta, s: _smoothed(gap, s), reward=lambda a, b, beta: a - b),
+            "beta is not used at all: it multiplies the gap in the losses, and the log-ratios in the rewards.",
+        ),
+        Misconception(
             "beta-outside",
             _dpo(loss=lambda gap, beta, s: beta * _smoothed(gap, s)),
             "beta scales the loss, which only rescales the learning rate: it belongs inside the sigmoid.",
@@ -872,15 +877,15 @@ def _padded(left=(0, 4), right=(0, 4), prompt=(1, 4), completion=(1, 5), batch=5
         columns, stop = torch.arange(int((before + given + written + after_it).max())), before + given + written
         return {
             "attention_mask": (columns >= before[:, None]) & (columns < stop[:, None]),
-            "prompt_lengths": given,
+            "prompt_tokens": given,
         }
 
     return inputs
 
 
-def _mask_by_walk(attention_mask, prompt_lengths):
+def _mask_by_walk(attention_mask, prompt_tokens):
     kept = torch.zeros_like(attention_mask)
-    for row, prompt in enumerate(prompt_lengths.tolist()):
+    for row, prompt in enumerate(prompt_tokens.tolist()):
         own = attention_mask[row].nonzero().flatten()
         kept[row, own[prompt:]] = True
     return kept
@@ -889,12 +894,12 @@ def _mask_by_walk(attention_mask, prompt_lengths):
 def _repair(formula, checked=True):
     """A version: `formula` takes the mask (B, L), columns (L,) and the prompts' lengths (B, 1)."""
 
-    def version(attention_mask, prompt_lengths):
-        if checked and len(attention_mask) != len(prompt_lengths):
-            raise ValueError(f"attention_mask has {len(attention_mask)} rows, but prompt_lengths has {len(prompt_lengths)}")
-        rows = len(prompt_lengths) if len(prompt_lengths) > 1 else len(attention_mask)
+    def version(attention_mask, prompt_tokens):
+        if checked and len(attention_mask) != len(prompt_tokens):
+            raise ValueError(f"attention_mask has {len(attention_mask)} rows, but prompt_tokens has {len(prompt_tokens)}")
+        rows = len(prompt_tokens) if len(prompt_tokens) > 1 else len(attention_mask)
         mask = attention_mask[:rows]
-        return formula(mask, torch.arange(mask.shape[1]), prompt_lengths[: len(mask), None])
+        return formula(mask, torch.arange(mask.shape[1]), prompt_tokens[: len(mask), None])
 
     return version
 
@@ -929,7 +934,7 @@ REPAIRED_COMPLETION_MASK = Exercise(
         Case("completions of one token", _padded(completion=(1, 2)), closed_form=_mask_by_walk),
         Case("no prompt at all", _padded(prompt=(0, 1)), closed_form=_mask_by_walk),
         Case("one text", _padded(left=(1, 3), right=(1, 3), batch=1), closed_form=_mask_by_walk),
-        *shape_cases(_padded(), ("attention_mask", "prompt_lengths")),
+        *shape_cases(_padded(), ("attention_mask", "prompt_tokens")),
     ),
     misconceptions=(
         Misconception(
@@ -946,7 +951,7 @@ REPAIRED_COMPLETION_MASK = Exercise(
         Misconception(
             "prompt-counted",
             _repair(lambda mask, columns, prompts: mask & (prompts >= 0)),
-            "The prompt's tokens count as well. They were given, not written: leave out the first prompt_lengths[b] own tokens.",
+            "The prompt's tokens count as well. They were given, not written: leave out the first prompt_tokens[b] own tokens.",
         ),
         Misconception(
             "padding-on-the-left-forgotten",
@@ -985,8 +990,8 @@ REPAIRED_COMPLETION_MASK = Exercise(
         ),
         Misconception(
             "input-changed",
-            lambda attention_mask, prompt_lengths: (
-                ch97.repaired_completion_mask(attention_mask, prompt_lengths),
+            lambda attention_mask, prompt_tokens: (
+                ch97.repaired_completion_mask(attention_mask, prompt_tokens),
                 attention_mask.logical_not_(),
             )[0],
             "The caller's tensor is changed (by &= or a method that ends in _), and the network is given it afterwards.",
@@ -994,8 +999,8 @@ REPAIRED_COMPLETION_MASK = Exercise(
         Misconception("bad-input-accepted", _repair(_own, checked=False), SHAPES),
     ),
     variants={
-        "walk": lambda attention_mask, prompt_lengths: (
-            _repair(_own)(attention_mask, prompt_lengths) & _mask_by_walk(attention_mask, prompt_lengths)
+        "walk": lambda attention_mask, prompt_tokens: (
+            _repair(_own)(attention_mask, prompt_tokens) & _mask_by_walk(attention_mask, prompt_tokens)
         ),
         "columns from the first own token": _repair(_own),
         "positions as the network counts them": _repair(
