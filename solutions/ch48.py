@@ -71,7 +71,7 @@ def sac_actor_loss(q1, q2, log_probs, alpha):
 
         L = mean(α log π(a|s) - min(Q₁, Q₂)),   a = tanh(μ(s) + σ(s) ε)
 
-    Haarnoja et al. (2018b), section 5, https://arxiv.org/abs/1812.05905
+    Haarnoja et al. (2018b), sections 4.2 and 6, https://arxiv.org/abs/1812.05905
 
     Args:
       q1, q2: the critics' values of the policy's own actions, in units of reward; (B,).
