@@ -85,3 +85,31 @@ def test_answers_that_are_no_bools_for_each_pair_cannot_be_read(answers):
 def test_no_answers_cannot_be_read():
     with pytest.raises(ValueError, match="bool tensor"):
         views.group_frequencies(KINDS, {})
+
+
+def imagined(continues, fill=7.0):
+    """Trajectories of two numbers a state and one an action, all of them `fill`, with these `continues` (H, B)."""
+    continues = np.array(continues, dtype=float)
+    steps, batch = continues.shape
+    shapes = {"obs": (steps + 1, batch, 2), "actions": (steps, batch, 1), "rewards": (steps, batch)}
+    return {name: np.full(shape, fill) for name, shape in shapes.items()} | {"continues": continues}
+
+
+def test_what_comes_after_an_end_does_not_count_and_what_led_to_it_does():
+    kept = views.until_the_end({}, imagined([[1, 1], [0, 1], [0, 1]]))
+    assert (kept["obs"][:, :, 0] != 0).tolist() == [[True, True], [True, True], [True, True], [False, True]]
+    assert (
+        (kept["actions"][:, :, 0] != 0).tolist() == (kept["rewards"] != 0).tolist() == [[True, True], [True, True], [False, True]]
+    )
+    assert kept["continues"].tolist() == [[1, 1], [0, 1], [0, 1]]
+
+
+def test_whoever_comes_back_to_life_is_seen():
+    assert views.until_the_end({}, imagined([[0], [1]]))["continues"].tolist() == [[0], [1]]
+
+
+def test_imagined_entries_of_shapes_that_do_not_fit_are_left_alone_and_others_cannot_be_read():
+    outputs = imagined([[1, 1], [0, 1]]) | {"rewards": np.ones(3)}
+    assert all(views.until_the_end({}, outputs)[name] is outputs[name] for name in outputs)
+    with pytest.raises(ValueError, match="obs, actions, rewards, continues"):
+        views.until_the_end({}, {"obs": np.ones(3)})
