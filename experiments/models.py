@@ -1,10 +1,10 @@
 """Model-based policy optimisation on Pendulum and Walker2d: how long to dream, what a stale model costs, and how wrong models are.
 
-The protocol of evaluation is that of `control`, so that the records can be laid beside each other. Variants of `pendulum` change one
-setting each: how many steps a dream has (`h0`: no model at all, but as many updates, all on real steps), or that the first model is
-the last (`stale`). Each row also has what `model_error_by_horizon` finds on fresh trajectories of the policy as it is then:
-`error_1`, `error_2`, …, and for comparison `still_1`, …: the error of predicting that nothing moves. `pendulum_film` is one run of
-`pendulum` and a video: a real trajectory beside what an early and the last model imagine.
+The protocol of evaluation is that of `control`, so that the records can be laid beside each other. Variants of `pendulum` and
+`walker2d` change one setting each: how many steps a dream has (`h0`: no model at all, but as many updates, all on real steps), or
+that the first model is the last (`stale`). Each row also has what `model_error_by_horizon` finds on fresh trajectories of the policy
+as it is then: `error_1`, `error_2`, …, and for comparison `still_1`, …: the error of predicting that nothing moves. `pendulum_film`
+is one run of `pendulum` and a video: a real trajectory beside what an early and the last model imagine.
 """
 
 from __future__ import annotations
@@ -27,28 +27,30 @@ from experiments.runner import Report, Result
 from solutions import ch48, ch51
 
 PENDULUM = MBPOSettings()
+WALKER2D = MBPOSettings(
+    total_steps=15_000,
+    learning_starts=2_000,
+    batch_size=256,
+    learning_rate=3e-4,
+    hidden=256,
+    updates=5,
+    horizon=1,
+    refresh_every=500,
+    imagined_steps=50_000,
+    imagined_size=100_000,
+    gamma=0.99,
+    tau=0.005,
+    model_hidden=200,
+    model_batch=256,
+    model_learning_rate=1e-3,
+)
 SETTINGS = {
     "pendulum": PENDULUM,
     **{f"pendulum_h{horizon}": PENDULUM.but(horizon=horizon) for horizon in (0, 1, 20)},
     "pendulum_stale": PENDULUM.but(refreshed=False),
     "pendulum_film": PENDULUM,
-    "walker2d": MBPOSettings(
-        total_steps=15_000,
-        learning_starts=2_000,
-        batch_size=256,
-        learning_rate=3e-4,
-        hidden=256,
-        updates=5,
-        horizon=1,
-        refresh_every=500,
-        imagined_steps=50_000,
-        imagined_size=100_000,
-        gamma=0.99,
-        tau=0.005,
-        model_hidden=200,
-        model_batch=256,
-        model_learning_rate=1e-3,
-    ),
+    "walker2d": WALKER2D,
+    "walker2d_h0": WALKER2D.but(horizon=0),
 }
 EVERY = {"pendulum": 100, "walker2d": 1_000}  # environment steps between evaluations
 CHUNK = {"pendulum": 100, "walker2d": 50}  # steps between looks at the clock
@@ -66,7 +68,7 @@ def _configuration(variant: str, settings: MBPOSettings) -> dict[str, Any]:
 
 
 VARIANTS = {variant: _configuration(variant, settings) for variant, settings in SETTINGS.items()}
-SEEDS = {variant: {"pendulum": 10, "walker2d": 3, "pendulum_film": 1}.get(variant, 5) for variant in VARIANTS}
+SEEDS = {variant: {"pendulum": 10, "walker2d": 3, "walker2d_h0": 3, "pendulum_film": 1}.get(variant, 5) for variant in VARIANTS}
 EARLY, FILMED_STEPS, SIZE = 300, 100, 200  # real steps of the early model; steps of the video; pixels of each of its panels
 
 
