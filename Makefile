@@ -20,8 +20,10 @@ release: install
 
 test: install
 	tools/system-packages
-	$(BIN)/python -m pytest -n 2 --dist loadfile $(TWO_AT_A_TIME)
-	$(BIN)/python -m pytest $(WHOLE_MACHINE)
+	status=0; \
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(TWO_AT_A_TIME) || status=1; \
+	$(BIN)/python -m pytest $(WHOLE_MACHINE) || status=1; \
+	exit $$status
 
 check: install
 	$(BIN)/ruff check
