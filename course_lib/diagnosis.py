@@ -6,6 +6,7 @@ of data: nothing of the learner's is executed here.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -109,9 +110,14 @@ def _differs_from_expected(case: FrozenCase, seen: Observation) -> set[str]:
 
 def _refusal(seen: Observation, case: FrozenCase) -> str:
     """How a call that must raise ended: "refused" if rightly, the exception's name, or "returned"."""
-    if seen.error == "ValueError" and any(name in seen.message for name in case.raises):
+    if seen.error == "ValueError" and any(_is_named(name, seen.message) for name in case.raises):
         return "refused"
     return seen.error or "returned"
+
+
+def _is_named(name: str, message: str) -> bool:
+    """Whether a message names an argument; one of a single letter, such as n, stands between no others."""
+    return bool(re.search(rf"(?<![A-Za-z]){name}(?![A-Za-z])", message)) if len(name) == 1 else name in message
 
 
 def _close(seen: np.ndarray, target: np.ndarray, case: FrozenCase) -> np.ndarray:

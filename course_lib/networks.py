@@ -8,6 +8,7 @@ an ordinary differentiable function: compute a loss from what `networks(inputs)`
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
@@ -155,6 +156,11 @@ class Adam:
         self.mean.copy_(state["mean"])
         self.square.copy_(state["square"])
         self.steps = state["steps"]
+
+
+def one_pass(tensors) -> Iterator[torch.Tensor]:
+    """Tensors as `Module.parameters()` hands them out: whoever has gone through them once finds none."""
+    return iter(tensors)
 
 
 def parameters(tensors) -> list[torch.nn.Parameter]:

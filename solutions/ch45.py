@@ -25,7 +25,7 @@ def gaussian_log_prob(mean, log_std, actions):
       mean: μ(s); (B, A). Receives gradient.
       log_std: log σ, the same in every state, (A,), or one for each, (B, A). Receives
         gradient.
-      actions: as sampled, before clipping to the bounds; (B, A). No gradient.
+      actions: as sampled, before clipping to the bounds; (B, A).
 
     Returns: (B,) nats, summed over the components.
     Raises: ValueError if the shapes of mean and actions differ, or log_std is neither (A,)
@@ -140,7 +140,7 @@ def ppo_loss(log_probs, old_log_probs, advantages, values, returns, entropy, cli
       ent_coef: c_e, the weight of the entropy.
 
     Returns: (scalar loss, metrics), where metrics holds policy_loss, value_loss, entropy,
-      approx_kl and clip_fraction as 0-dim tensors without a graph.
+      approx_kl and clip_fraction, and nothing else, as 0-dim tensors without a graph.
     Raises: ValueError if the shapes of all but entropy differ, entropy is neither (B,) nor
       (), or clip_range < 0.
     """

@@ -131,7 +131,7 @@ def repaired_segment_returns(reward_model, obs, mask):
       obs: of every step, padded to a common length; (B, T, O). Receives gradient.
       mask: (B, T) bool, True on steps that belong to the segment.
 
-    Returns: (B,) returns, in the reward model's unit, whatever stands in the padding.
+    Returns: (B,) returns, in the reward model's unit, whatever numbers stand in the padding.
     Raises: ValueError if the leading shapes (B, T) of obs and mask differ.
     """
     if obs.shape[:-1] != mask.shape:

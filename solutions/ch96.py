@@ -99,7 +99,7 @@ def length_correlation(scores, lengths):
     """
     validate.same_shape(scores=scores, lengths=lengths)
     a = scores.detach() - scores.detach().mean()
-    b = lengths.to(scores.dtype) - lengths.to(scores.dtype).mean()
+    b = lengths.detach().to(scores.dtype) - lengths.detach().to(scores.dtype).mean()
     return (a * b).sum() / (a.square().sum() * b.square().sum()).sqrt()
 
 

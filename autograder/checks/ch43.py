@@ -7,6 +7,7 @@ import math
 import numpy as np
 import torch
 
+from autograder.mistakes import SHAPES
 from autograder.spec import Case, Exercise, Misconception
 from course_lib import validate
 from solutions import ch43
@@ -120,6 +121,7 @@ _VALIDATE = (
 )
 _DTYPE = "The result has lost the inputs' dtype: cast masks with .to(log_probs.dtype), not with .float()."
 _SCALAR = "Return a 0-dim tensor, not a Python float: .item() cuts the graph that the optimiser needs."
+_NUMBER = "Return a 0-dim tensor, not a Python float: .item() makes a device wait; convert once, where you log."
 _METRIC = "A reported metric carries no graph: detach it, or it keeps the whole network's activations alive."
 _DETACHED = "The loss reaches no parameter: detach only what is data, never the ratio or log_probs."
 _INVERTED = "The ratio is old over new: it is exp(log_probs - old_log_probs), new minus old."
@@ -167,9 +169,9 @@ def _after(function, change):
     return lambda *args, **kwargs: change(function(*args, **kwargs))
 
 
-def _spoilt(function):
+def _spoilt(function, message=_SCALAR):
     return (
-        Misconception("python-float", _after(function, torch.Tensor.item), _SCALAR),
+        Misconception("python-float", _after(function, torch.Tensor.item), message),
         Misconception("dtype-lost", _after(function, torch.Tensor.float), _DTYPE),
     )
 
@@ -370,7 +372,7 @@ IMPORTANCE_RATIO = Exercise(
         Misconception("ratio-detached", _ratios(lambda new, old: _ratio(new, old).detach()), _DETACHED),
         Misconception("dtype-lost", _after(ch43.importance_ratio, torch.Tensor.float), _DTYPE),
         Misconception("log-probs-changed-in-place", _ratio_mutating, _IN_PLACE),
-        Misconception("bad-input-accepted", _ratios(_ratio, checked=False), _VALIDATE),
+        Misconception("bad-input-accepted", _ratios(_ratio, checked=False), SHAPES),
     ),
     variants={
         "its own buffer": _ratio_variant(lambda new, old: (new - old.detach()).exp_()),
@@ -540,6 +542,7 @@ CLIPPED_SURROGATE_LOSS = Exercise(
         ),
         Case("clip_range = 0.05", _batch(clip_range=0.05), closed_form=_clip_by_cases, visible=True, draws=1),
         Case("clip_range = 0", _batch(clip_range=0), closed_form=_clip_by_cases, visible=True, draws=1),
+        Case("clip_range = 1.5", _batch(spread=1.0, clip_range=1.5), closed_form=_clip_by_cases, draws=1),
         Case("clip_range = infinity, one advantage is 0", _zero_advantage, closed_form=_clip_by_cases, visible=True, draws=1),
         Case("very unlikely actions", _batch(base=-900.0), closed_form=_clip_by_cases, visible=True, draws=1),
         Case("log-ratios around ±20", _quadrants(20.0), closed_form=_clip_by_cases, draws=1),
@@ -729,8 +732,8 @@ APPROX_KL = Exercise(
         ),
         Misconception("probabilities-divided", _metric(lambda r, e: (r - 1 - r.log()).mean(), _quotient), _QUOTIENT),
         Misconception("graph-kept", _kl_graph, _METRIC),
-        *_spoilt(ch43.approx_kl),
-        Misconception("bad-input-accepted", _kl(lambda r, d: r - 1 - d, checked=False), _VALIDATE),
+        *_spoilt(ch43.approx_kl, _NUMBER),
+        Misconception("bad-input-accepted", _kl(lambda r, d: r - 1 - d, checked=False), SHAPES),
         Misconception(
             "log-probs-changed-in-place",
             _metric(lambda d, e: (d.expm1() - d).mean(), lambda new, old: new.detach().sub_(old.detach())),
@@ -840,7 +843,7 @@ CLIP_FRACTION = Exercise(
             _ZERO,
         ),
         Misconception("graph-kept", _fraction_graph, _METRIC),
-        *_spoilt(ch43.clip_fraction),
+        *_spoilt(ch43.clip_fraction, _NUMBER),
         Misconception(
             "bad-input-accepted", _metric(lambda r, e: ((r - 1).abs() > e).to(r.dtype).mean(), checked=False), _VALIDATE
         ),
@@ -861,13 +864,13 @@ CLIP_FRACTION = Exercise(
 # ------------------------------------------------------------------------------------------------------- repaired_losses
 
 
-def _rollout(epochs=4, size=16, spread=0.35, **scalars):
+def _rollout(epochs=4, size=16, spread=0.35, base=-2.0, **scalars):
     """Log-probabilities that drift away from those of row 0."""
 
     def inputs(generator):
         drift = spread * _normal(generator, epochs, size).cumsum(0)
         drift = _off_bounds(drift - drift[0], **scalars)
-        return {"log_probs": drift - 2 + _normal(generator, size), "advantages": _normal(generator, size) + 0.3} | scalars
+        return {"log_probs": drift + base + _normal(generator, size), "advantages": _normal(generator, size) + 0.3} | scalars
 
     return inputs
 
@@ -928,7 +931,9 @@ REPAIRED_LOSSES = Exercise(
         Case("ten epochs", _rollout(epochs=10), closed_form=_losses_by_cases),
         Case("clip_range = 0.05", _rollout(clip_range=0.05), closed_form=_losses_by_cases, visible=True),
         Case("clip_range = 0", _rollout(clip_range=0), closed_form=_losses_by_cases),
+        Case("clip_range = 1.5", _rollout(spread=0.7, clip_range=1.5), closed_form=_losses_by_cases),
         Case("clip_range = infinity", _rollout(clip_range=INF), closed_form=_losses_by_cases),
+        Case("very unlikely actions", _rollout(base=-900.0), closed_form=_losses_by_cases),
         Case("both inputs require gradient", _rollout(), differentiate=_BOTH, visible=True, draws=3),
         Case("gradient where the policy stands still", _standstill, differentiate=_BOTH),
         Case("single precision", _rollout(), dtype=torch.float32, visible=True),

@@ -149,6 +149,7 @@ GAUSSIAN_LOG_PROB = Exercise(
         _case("as many samples as dimensions", _actions(size=4, dims=4), closed_form=_density_by_hand),
         _case("twenty dimensions, far from the mean", _actions(dims=20, spread=12.0), closed_form=_density_by_hand, visible=True),
         _case("a very wide policy", _actions(base=4.0), closed_form=_density_by_hand),
+        _case("a very narrow policy", _actions(base=-8.0), closed_form=_density_by_hand),
         _case("mean and log_std require gradient", _actions(), differentiate=("mean", "log_std"), visible=True, draws=1),
         _case("log_std (B, A) requires gradient", _actions(per_sample=True), differentiate=("mean", "log_std")),
         _case("single precision", _actions(), dtype=torch.float32, visible=True),
@@ -855,6 +856,8 @@ PPO_LOSS = Exercise(
         _case("no entropy bonus", _update(ent_coef=0.0), closed_form=_loss_by_hand),
         _case("no value loss", _update(vf_coef=0.0), closed_form=_loss_by_hand),
         _case("clip_range = 0.05", _update(clip_range=0.05), closed_form=_loss_by_hand, visible=True),
+        _case("clip_range = 0", _update(clip_range=0.0), closed_form=_loss_by_hand),
+        _case("clip_range = 1.5", _update(clip_range=1.5, spread=1.0), closed_form=_loss_by_hand),
         _case("clip_range = infinity", _update(clip_range=INF, spread=1.0), closed_form=_loss_by_hand),
         _case("very unlikely actions", _update(base=-900.0), closed_form=_loss_by_hand, visible=True),
         _case("all inputs require gradient", _update(), differentiate=(*_COLUMNS, "entropy"), visible=True, draws=1),
@@ -1423,6 +1426,7 @@ PPO_UPDATE = Exercise(
         _case("the metrics of two minibatches, learning rate 0", _updated(12, 6, learning_rate=0.0), visible=True),
         _case("steps, where the first epoch goes too far", _updated(12, 6, target_kl=1e-4), **_STEPS, visible=True),
         _case("steps, where nothing does", _updated(10, 4), **_STEPS),
+        _case("what is drawn from", _updated(12, 6), returns=("generator",), view="drawn_from"),
     ),
     misconceptions=(
         Misconception(

@@ -47,11 +47,11 @@ def _same_shapes(**tensors):
 _SQUASHED = ("mean", "log_std", "pre_tanh_actions")
 
 
-def _squashed(size=7, dims=3, reach=1.0):
+def _squashed(size=7, dims=3, reach=1.0, base=-0.5):
     """Pre-activations at `reach` standard deviations from the mean or so."""
 
     def inputs(generator):
-        mean, log_std = normal(generator, size, dims), -0.5 + 0.4 * normal(generator, size, dims)
+        mean, log_std = normal(generator, size, dims), base + 0.4 * normal(generator, size, dims)
         return {
             "mean": mean,
             "log_std": log_std,
@@ -129,6 +129,8 @@ SQUASHED_GAUSSIAN_LOG_PROB = Exercise(
             visible=True,
         ),
         Case("a single component", _squashed(dims=1), closed_form=_by_hyperbolic_cosine, visible=True),
+        Case("a single action", _squashed(1), closed_form=_by_hyperbolic_cosine),
+        Case("deviations around e⁴", _squashed(base=4.0), closed_form=_by_hyperbolic_cosine),
         Case("as many samples as components", _squashed(4, 4), closed_form=_by_hyperbolic_cosine),
         Case("far into saturation", _saturated(), closed_form=_by_hyperbolic_cosine, visible=True, draws=2),
         Case("u of hundreds", _saturated(low=200.0, high=900.0), closed_form=_by_hyperbolic_cosine),
@@ -681,12 +683,13 @@ TEMPERATURE_LOSS = Exercise(
 _PAIR = ("target_params", "online_params")
 
 
-def _networks(tau=0.1, shapes=((3, 4), (4,), ()), parameters=()):
-    """Parameters of two networks; those named in `parameters` require gradient."""
+def _networks(tau=0.1, shapes=((3, 4), (4,), ()), parameters=(), once=()):
+    """Parameters of two networks; those named in `parameters` require gradient, those in `once` can be gone through once."""
 
     def inputs(generator):
         drawn = {name: [normal(generator, *shape) for shape in shapes] for name in _PAIR}
         made = {name: built("networks.parameters", tensors=drawn[name]) if name in parameters else drawn[name] for name in _PAIR}
+        made |= {name: built("networks.one_pass", tensors=drawn[name]) for name in once}
         return made | {"tau": tau}
 
     return inputs
@@ -738,9 +741,19 @@ def _also_online(target, online, tau):
     online.copy_(target)
 
 
+def _used_up(target_params, online_params, tau):
+    """Right for lists."""
+    _polyak(lambda target, online, tau: None)(target_params, online_params, tau)
+    with torch.no_grad():
+        for target, online in zip(target_params, online_params, strict=False):
+            target.lerp_(online, tau)
+
+
 def _rebound(target, online, tau):
     target = (1 - tau) * target + tau * online
 
+
+_NAMED = ("target", "online")  # the arguments, or their tensors
 
 POLYAK_UPDATE = Exercise(
     name="polyak_update",
@@ -755,15 +768,17 @@ POLYAK_UPDATE = Exercise(
         Case("one tensor", _networks(0.2, shapes=((5,),)), returns=("target_params",)),
         Case("online parameters require gradient", _networks(parameters=_PAIR[1:]), returns=("target_params",), visible=True),
         Case("all parameters require gradient", _networks(parameters=_PAIR), returns=("target_params",), visible=True),
+        Case("online parameters as a module hands them out", _networks(once=_PAIR[1:]), returns=("target_params",), visible=True),
         Case("single precision", _networks(), returns=("target_params",), dtype=torch.float32, visible=True),
         Case(
             "a tensor of one row in place of three",
             _mismatch(lambda tensor: tensor[:1]),
             returns=("target_params",),
-            raises=_PAIR,
+            raises=_NAMED,
             visible=True,
         ),
-        Case("a tensor without its last axis", _mismatch(lambda tensor: tensor[0]), returns=("target_params",), raises=_PAIR),
+        Case("a tensor without its last axis", _mismatch(lambda tensor: tensor[0]), returns=("target_params",), raises=_NAMED),
+        Case("a transposed tensor", _mismatch(lambda tensor: tensor.T), returns=("target_params",), raises=_NAMED),
         Case("tau = 1.5", _networks(1.5), returns=("target_params",), raises=("tau",), visible=True),
         Case("tau = -0.1", _networks(-0.1), returns=("target_params",), raises=("tau",)),
     ),
@@ -802,6 +817,12 @@ POLYAK_UPDATE = Exercise(
             "not-in-place",
             _polyak(_rebound),
             "target = … gives a name to a new tensor, and the network's own one stays as it is: use a method that ends in _.",
+        ),
+        Misconception(
+            "checked-and-used-up",
+            _used_up,
+            "The check goes through the parameters, and what can be gone through once, such as net.parameters(), has nothing left for the"
+            " update: nothing moves. Do both in one loop.",
         ),
         Misconception(
             "first-tensor-only",
@@ -1334,6 +1355,8 @@ def _by_interpolation(sent, low, high):
     return torch.from_numpy(np.stack(columns, 1)).to(sent.dtype)
 
 
+_STUCK = torch.tensor([3.0, 0.5], dtype=torch.float64)  # the second motor's low, too
+
 REPAIRED_TRANSITIONS = Exercise(
     name="repaired_transitions",
     reference=ch48.repaired_transitions,
@@ -1349,6 +1372,7 @@ REPAIRED_TRANSITIONS = Exercise(
         Case(
             "low above high", replaced(_motor_steps(), low=torch.full((2,), 5.0)), raises=["low", "high"], visible=True, draws=1
         ),
+        Case("one motor that cannot move", replaced(_motor_steps(), high=_STUCK), raises=["low", "high"], draws=1),
         *shape_cases(_motor_steps(), _ROWS),
     ),
     misconceptions=(

@@ -47,6 +47,13 @@ def _ensemble(members=3, batch=5, dims=4, own_samples=False):
     return inputs
 
 
+def _extremes(generator):
+    """Standard deviations of e^±5.5, and targets within them."""
+    drawn = _ensemble(own_samples=True)(generator)
+    log_var = 11 * drawn["log_var"].sign()
+    return drawn | {"log_var": log_var, "targets": drawn["mean"] + (0.5 * log_var).exp() * drawn["targets"]}
+
+
 def _standard_and_right(generator):
     """Every mean is right, and every variance 1."""
     drawn = _ensemble()(generator)
@@ -96,6 +103,7 @@ GAUSSIAN_NLL = Exercise(
         ),
         Case("as many members as samples", _ensemble(4, 4, 2), closed_form=_nll_by_hand),
         Case("a single member", _ensemble(1, 6, 2), closed_form=_nll_by_hand),
+        Case("members that are very sure, or not at all", _extremes, closed_form=_nll_by_hand),
         Case("all inputs require gradient", _ensemble(), differentiate=_PREDICTED, visible=True, draws=2),
         Case("own samples, gradient", _ensemble(own_samples=True), differentiate=_PREDICTED),
         Case("single precision", _ensemble(), dtype=torch.float32, visible=True),
@@ -270,6 +278,10 @@ def _ending(generator):
     return drawn | {"start_obs": start}
 
 
+def _all_ending(generator):
+    return _ending(generator) | {"start_obs": 3 + normal(generator, 4, 2).abs()}
+
+
 def _view(name, inputs, **options):
     return Case(name, inputs, view="until_the_end", **options)
 
@@ -389,6 +401,7 @@ IMAGINE = Exercise(
         _view("five steps, no noise", _dreams(), visible=True, draws=2),
         _view("noise in the policy and the model", _dreams(noise=0.3), visible=True, draws=2),
         _view("trajectories that end", _ending, visible=True, draws=2),
+        _view("all end with the first step", _all_ending),
         _view("one step", _dreams(horizon=1), visible=True),
         _view("a single start", _dreams(batch=1)),
         _view("as many starts as steps", _dreams(batch=4, horizon=4, obs_dim=4)),
@@ -600,6 +613,7 @@ DREAMER_LAMBDA_RETURNS = Exercise(
         Case("lam = 1: all rewards and the last value", _imagined(lam=1.0, ends=0.0), closed_form=_monte_carlo, visible=True),
         Case("gamma = 1", _imagined(gamma=1.0), closed_form=_as_sum),
         Case("one step", _imagined(1), closed_form=_as_sum),
+        Case("one step, which ends", _imagined(1, ends=1.0), closed_form=_as_sum),
         Case("as many trajectories as steps", _imagined(5, 5), closed_form=_as_sum),
         Case("a model that is not sure of the end", _fractions, closed_form=_as_sum, visible=True),
         Case("rewards and values require gradient", _imagined(), differentiate=("rewards", "values"), visible=True, draws=2),
@@ -723,11 +737,11 @@ DREAMER_LAMBDA_RETURNS = Exercise(
 # ---------------------------------------------------------------------------------------------------- model_error_by_horizon
 
 
-def _trajectories(steps=5, batch=6, obs_dim=3, action_dim=2, noise=0.0):
+def _trajectories(steps=5, batch=6, obs_dim=3, action_dim=2, noise=0.0, limit=math.inf):
     """Real trajectories that a model does not quite know."""
 
     def inputs(generator):
-        model, _ = _world(generator, obs_dim, action_dim, noise, math.inf)
+        model, _ = _world(generator, obs_dim, action_dim, noise, limit)
         return {
             "model": model,
             "obs": normal(generator, steps + 1, batch, obs_dim) * torch.linspace(0.5, 2.0, obs_dim, dtype=torch.float64),
@@ -806,6 +820,7 @@ MODEL_ERROR_BY_HORIZON = Exercise(
         Case("a single trajectory", _trajectories(batch=1)),
         Case("as many trajectories as steps", _trajectories(4, 4, 4)),
         Case("calls of the model", _trajectories(), returns=("model",)),
+        Case("a model that believes in ends", _trajectories(limit=0.5)),
         Case("single precision", _trajectories(), dtype=torch.float32, visible=True),
         Case(
             "as many obs as actions",
@@ -814,6 +829,9 @@ MODEL_ERROR_BY_HORIZON = Exercise(
             visible=True,
         ),
         Case("obs of one trajectory", reshaped(_trajectories(), "obs", lambda x: x[:, :1]), raises=("obs", "actions")),
+        Case(
+            "obs a step too long", reshaped(_trajectories(), "obs", lambda x: torch.cat([x, x[-1:]])), raises=("obs", "actions")
+        ),
     ),
     misconceptions=(
         Misconception(

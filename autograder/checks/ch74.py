@@ -350,6 +350,11 @@ def _even(count, length=7):
     return lambda _generator: _steps([length] * count)
 
 
+def _in_turns(_generator):
+    """One step of each episode, again and again, as from parallel environments."""
+    return torch.arange(12).repeat(5)
+
+
 def _uneven(generator):
     return _steps(torch.randint(2, 30, (40,), generator=generator))
 
@@ -487,7 +492,10 @@ SPLIT_BY_EPISODE = Exercise(
         Case("thirty episodes, one of them a giant", _split(_one_giant, 0.1), view="episode_split", draws=2),
         Case("two hundred short episodes, half held out", _split(_even(200, 3), 0.5), view="episode_split", draws=2),
         Case("numbers with gaps, steps in any order", _split(_odd_numbers, 0.3), view="episode_split", visible=True, draws=3),
+        Case("episodes in turns", _split(_in_turns, 0.3), view="episode_split"),
         Case("three episodes, a tenth held out", _split(_even(3), 0.1), view="episode_split", visible=True),
+        Case("five episodes, fraction = 0", _split(_even(5), 0.0), view="episode_split"),
+        Case("five episodes, fraction = 1", _split(_even(5), 1.0), view="episode_split"),
         Case("three episodes, nearly all held out", _split(_even(3), 0.95), view="episode_split"),
         Case("two splits in a row", _split(_even(60, 2), 0.5), repeat=2, view="two_splits", visible=True),
         Case(
@@ -824,6 +832,7 @@ GAUSSIAN_CLONING_LOSS = Exercise(
         Case("one action", _continuous(actions=1), closed_form=_gaussian_by_hand),
         Case("as many actions as rows", _continuous(4, 4), closed_form=_gaussian_by_hand),
         Case("σ around e⁻⁸", _continuous(log_std=-8.0), closed_form=_gaussian_by_hand),
+        Case("σ around e⁴", _continuous(log_std=4.0), closed_form=_gaussian_by_hand),
         Case("all inputs require gradient", _continuous(), differentiate=["mean", "log_std", "expert_actions"], visible=True),
         Case("gradient to a σ for every state", _continuous(per_state=True), differentiate=["mean", "log_std", "expert_actions"]),
         Case("single precision", _continuous(), dtype=torch.float32, visible=True),
@@ -1530,6 +1539,7 @@ REPAIRED_PAIRS = Exercise(
         Case("an episode of one step among others", _log((3, 1, 4, 1)), closed_form=_pairs(_by_index), visible=True),
         Case("numbers with gaps, out of order", _log((4, 5, 3), [7, 2, 40]), closed_form=_pairs(_by_index)),
         Case("many episodes", _log((3,) * 12), closed_form=_pairs(_by_index)),
+        Case("one pair", _log((1, 2, 1)), closed_form=_pairs(_by_index)),
         Case("single precision", _log(), dtype=torch.float32, visible=True),
         Case(
             "actions with a row too few",

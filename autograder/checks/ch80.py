@@ -621,6 +621,7 @@ PREFERENCE_ACCURACY = Exercise(
         Case("no choice foreseen", _choice_gaps(-1.0, -2.0), closed_form=_counted, visible=True),
         Case("three of four", _choice_gaps(1.0, -9.0, 2.0, 0.5), closed_form=_counted, visible=True),
         Case("one choice", _choice_gaps(3.0), closed_form=_counted),
+        Case("returns of a thousand", _choices(level=1000.0), closed_form=_counted),
         Case("both inputs require gradient", _choices(), differentiate=_CHOICE, visible=True),
         Case("single precision", _both_positive_and_negative, dtype=torch.float32, visible=True),
         *_shape_cases(_CHOICE, _choices()),

@@ -640,6 +640,11 @@ def _whole(generator):
     return {"x": normal(generator, 3, 5), "mask": torch.ones(3, 5, dtype=torch.bool)}
 
 
+def _with_zeros(generator):
+    drawn = _entries()(generator)
+    return drawn | {"x": drawn["x"].clamp(min=0)}
+
+
 def _one_kept(generator):
     return {"x": normal(generator, 3, 5), "mask": torch.arange(15).reshape(3, 5) == int(integers(generator, 0, 15))}
 
@@ -682,6 +687,7 @@ MASKED_MEAN = Exercise(
         Case("scattered entries and an empty row", _scattered, closed_form=_mean_by_list, visible=True),
         Case("everything kept", _whole, closed_form=_mean_by_list),
         Case("one entry kept", _one_kept, closed_form=_mean_by_list, visible=True),
+        Case("zeros among the kept entries", _with_zeros, closed_form=_mean_by_list),
         Case("single precision", _entries(), dtype=torch.float32, visible=True),
         *shape_cases(_entries(), _X),
     ),
@@ -1159,6 +1165,12 @@ def _epoch(batch=5, length=7, spread=0.35, shape="middle", **scalars):
     return inputs
 
 
+def _one_far_ratio(generator):
+    drawn = _EPOCH(generator)
+    drawn["logps"][0, 1], drawn["advantages"][0, 1] = drawn["old_logps"][0, 1] + 8, -1.0
+    return drawn
+
+
 def _first_step(generator):
     drawn = _epoch()(generator)
     return drawn | {"old_logps": torch.where(drawn["mask"], drawn["logps"], drawn["old_logps"])}
@@ -1231,6 +1243,7 @@ PPO_TOKEN_LOSS = Exercise(
             visible=True,
         ),
         Case("ratios far outside", _epoch(spread=2.0), closed_form=_loss_by_tokens),
+        Case("a token that has become 3,000 times as likely", _one_far_ratio, closed_form=_loss_by_tokens),
         Case("everything kept", _all_kept(_epoch(3, 5)), closed_form=_loss_by_tokens),
         Case("what is given requires gradient", _EPOCH, differentiate=_PPO[:3], visible=True, draws=3),
         Case("gradient in the first step", _first_step, differentiate=_PPO[:3], visible=True),

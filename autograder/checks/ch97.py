@@ -42,6 +42,12 @@ def _texts(generator, batch=4, length=9, vocabulary=7, scale=2.0):
     }
 
 
+def _two_tokens(generator):
+    """Each text's only prediction: what is squeezed too much loses an axis here."""
+    mask = torch.tensor([[False, True]]).repeat(3, 1)
+    return _texts(generator, 3, 2) | {"completion_mask": mask}
+
+
 def _whole_rows(generator):
     """Even the first column is marked."""
     drawn = _texts(generator)
@@ -144,6 +150,7 @@ SEQUENCE_LOGPS = Exercise(
         Case("a row with nothing kept: 0", _nothing_kept, closed_form=_by_token),
         Case("tokens that the model finds impossible", _unlikely, closed_form=_by_token),
         Case("one long text", lambda g: _texts(g, 1, 40, 11), closed_form=_by_token),
+        Case("texts of two tokens", _two_tokens, closed_form=_by_token),
         Case("logits that require gradient", _texts, differentiate=["logits"], visible=True),
         Case("single precision", _texts, dtype=torch.float32, visible=True),
         *shape_cases(_texts, _TEXTS),
@@ -933,6 +940,7 @@ REPAIRED_COMPLETION_MASK = Exercise(
         Case("no padding", _padded((0, 1), (0, 1), (2, 3), (4, 5)), closed_form=_mask_by_walk, visible=True),
         Case("completions of one token", _padded(completion=(1, 2)), closed_form=_mask_by_walk),
         Case("no prompt at all", _padded(prompt=(0, 1)), closed_form=_mask_by_walk),
+        Case("some prompts without a completion", _padded(completion=(0, 2), right=(1, 4)), closed_form=_mask_by_walk),
         Case("one text", _padded(left=(1, 3), right=(1, 3), batch=1), closed_form=_mask_by_walk),
         *shape_cases(_padded(), ("attention_mask", "prompt_tokens")),
     ),
