@@ -46,12 +46,13 @@ class TimerVectorEnv(gym.vector.VectorEnv):
       lengths: steps of an episode, one number for each of the N environments, at least 1.
       terminates: whether the task ends then, or only the recording; one bool for each environment.
       action_reward: what an action of 1 pays, in units of reward.
+      low, high: the bounds of the actions.
 
-    Observations: (N, 1) float32. Actions: (N, 1) float32 in [-1, 1].
+    Observations: (N, 1) float32. Actions: (N, 1) float32 in [low, high].
     Raises: ValueError if lengths and terminates differ in number, or a length is less than 1.
     """
 
-    def __init__(self, lengths=(3, 3), terminates=(True, False), action_reward=0.0):
+    def __init__(self, lengths=(3, 3), terminates=(True, False), action_reward=0.0, low=-1.0, high=1.0):
         self.lengths, self.terminates = np.asarray(lengths, dtype=int), np.asarray(terminates, dtype=bool)
         if self.lengths.shape != self.terminates.shape:
             raise ValueError(f"lengths and terminates must be of one length, got {lengths} and {terminates}")
@@ -59,7 +60,7 @@ class TimerVectorEnv(gym.vector.VectorEnv):
             raise ValueError(f"lengths must be at least 1, got {lengths}")
         self.num_envs, self.action_reward = len(self.lengths), action_reward
         self.single_observation_space = gym.spaces.Box(0.0, np.inf, (1,), np.float32)
-        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.single_action_space = gym.spaces.Box(low, high, (1,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}

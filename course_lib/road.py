@@ -35,11 +35,12 @@ class RoadEnv(gym.Env):
       bend: how strongly the road winds, in radians per step; 0 is a straight road.
       start: the offset at which an episode begins is drawn from ±start.
       discrete: three commands instead of any number.
+      one_array: every observation is the same array, filled anew, as fast environments have it.
 
     Raises: ValueError if time_limit is below 1, or gust, bend or start negative.
     """
 
-    def __init__(self, time_limit=200, gust=0.01, bend=0.05, start=0.2, discrete=False):
+    def __init__(self, time_limit=200, gust=0.01, bend=0.05, start=0.2, discrete=False, one_array=False):
         if time_limit is not None and time_limit < 1:
             raise ValueError(f"time_limit must be at least 1 or None, got {time_limit}")
         for name, value in {"gust": gust, "bend": bend, "start": start}.items():
@@ -49,6 +50,7 @@ class RoadEnv(gym.Env):
         self.observation_space = OBSERVATIONS
         self.action_space = CHOICES if discrete else COMMANDS
         self.ended = True
+        self.array = np.zeros(5, dtype=np.float32) if one_array else None
 
     def reset(self, *, seed=None, options=None):
         """Start an episode on a new road."""
@@ -78,7 +80,11 @@ class RoadEnv(gym.Env):
 
     def _observe(self):
         bends = self._bend_at(self.elapsed), self._bend_at(self.elapsed + 5)
-        return np.array([self.offset, self.heading, self.wheel, *bends], dtype=np.float32)
+        seen = np.array([self.offset, self.heading, self.wheel, *bends], dtype=np.float32)
+        if self.array is None:
+            return seen
+        self.array[:] = seen
+        return self.array
 
 
 class RoadDriver:

@@ -12,8 +12,9 @@ from torch.distributions import Independent, Normal
 from autograder.spec import Artefact, Case, Exercise, Misconception
 from course_lib import envs as environments
 from course_lib.cases import built
+from course_lib.policies import make_policy
 from course_lib.rollouts import Rollout, true_next_obs
-from solutions import ch45
+from solutions import ch43, ch45
 
 INF = math.inf
 HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
@@ -1074,6 +1075,11 @@ def _bounded(envs, actions):
     return actions.numpy().clip(envs.single_action_space.low, envs.single_action_space.high)
 
 
+def _clamped(envs, actions):
+    low, high = (torch.from_numpy(bound) for bound in (envs.single_action_space.low, envs.single_action_space.high))
+    return torch.clamp(actions, low, high).numpy()
+
+
 def _rollout(
     act=lambda policy, obs, generator: policy.act(obs, generator),
     executed=_bounded,
@@ -1091,10 +1097,12 @@ def _rollout(
         for _ in range(num_steps + extra_steps):
             before = torch.as_tensor(obs, dtype=torch.float32).clone()
             actions = act(policy, before, generator)
-            obs, rewards, terminated, truncated, info = envs.step(executed(envs, actions))
+            clipped = executed(envs, actions)
+            obs, rewards, terminated, truncated, info = envs.step(clipped)
             row = {
                 "obs": before,
                 "actions": actions,
+                "executed": torch.as_tensor(clipped),
                 "rewards": torch.as_tensor(rewards, dtype=torch.float32),
                 "next_obs": torch.as_tensor(successors(obs, info, before), dtype=torch.float32).clone(),
                 "terminated": torch.as_tensor(terminated).clone(),
@@ -1162,7 +1170,7 @@ _COLLECT_MISTAKES = (
     ),
     Misconception(
         "clipped-actions-recorded",
-        _recording(actions=lambda row: row["actions"].clamp(-1, 1)),
+        _recording(actions=lambda row: row["executed"]),
         "The actions are recorded as clipped. Their log-probability is then that of another action: record them as sampled.",
     ),
     Misconception(
@@ -1220,6 +1228,7 @@ COLLECT_ROLLOUT = Exercise(
             draws=1,
         ),
         _case("an end at the last step", _collecting("TimerVectorEnv", 6, **_PAYING), visible=True),
+        _case("bounds of -0.3 and 0.8", _collecting("TimerVectorEnv", 5, low=-0.3, high=0.8, **_PAYING), visible=True),
         _case("drones with a time limit", _collecting("HoverVectorEnv", 8, num_envs=4, time_limit=5), visible=True),
         _case("drones that fly away", _collecting("HoverVectorEnv", 12, steps=6, action=1.0, num_envs=3)),
     ),
@@ -1230,6 +1239,11 @@ COLLECT_ROLLOUT = Exercise(
             _rollout(executed=lambda envs, actions: actions.numpy()),
             "The environment gets actions beyond its bounds. Clip what is executed, and record what was sampled.",
         ),
+        Misconception(
+            "bounds-guessed",
+            _rollout(executed=lambda envs, actions: actions.numpy().clip(-1, 1)),
+            "-1 and 1 are the bounds of many action spaces, not of all: envs.single_action_space has low and high.",
+        ),
     ),
     variants={
         "memory made beforehand": lambda *given: _into_memory(*given),
@@ -1239,7 +1253,7 @@ COLLECT_ROLLOUT = Exercise(
                 np.asarray(info.get("_final_obs", np.zeros(len(obs), bool)))[:, None], info.get("final_obs", obs), obs
             )
         ),
-        "clipped by torch": _rollout(executed=lambda envs, actions: torch.clamp(actions, -1, 1).numpy()),
+        "clipped by torch": _rollout(executed=_clamped),
         "a dict": _rollout(finish=lambda rollout: Rollout(**{name: column.clone() for name, column in vars(rollout).items()})),
     },
 )
@@ -1311,6 +1325,22 @@ def _updated(size=16, minibatch_size=64, learning_rate=0.01, **settings):
             "settings": built("ppo.PPOSettings", **chosen),
             "generator": built("seeding.generator", seed=seeds[1]),
         }
+
+    return inputs
+
+
+def _near_the_mean(factor):
+    """Learning rate 0, so that the mean KL of an epoch is known beforehand: target_kl is `factor` times that."""
+
+    def inputs(generator):
+        state = generator.get_state()
+        drawn = _updated(12, 6, learning_rate=0.0)(generator)
+        batch = {name: torch.as_tensor(column) for name, column in drawn["batch"]["arguments"].items()}
+        policy = make_policy(**drawn["policy"]["arguments"])
+        log_probs, *_ = ch45.evaluate_actions(policy, batch["obs"], batch["actions"])
+        kl = ch43.approx_kl(log_probs, batch["old_log_probs"]).item()
+        generator.set_state(state)
+        return _updated(12, 6, learning_rate=0.0, target_kl=factor * kl)(generator)
 
     return inputs
 
@@ -1427,6 +1457,8 @@ PPO_UPDATE = Exercise(
         _case("steps, where the first epoch goes too far", _updated(12, 6, target_kl=1e-4), **_STEPS, visible=True),
         _case("steps, where nothing does", _updated(10, 4), **_STEPS),
         _case("what is drawn from", _updated(12, 6), returns=("generator",), view="drawn_from"),
+        _case("steps, where the mean stays just below target_kl", _near_the_mean(1.02), **_STEPS, draws=4),
+        _case("steps, where the mean is just above target_kl", _near_the_mean(0.97), **_STEPS, draws=4),
     ),
     misconceptions=(
         Misconception(

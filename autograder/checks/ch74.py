@@ -102,6 +102,7 @@ def _three_commands(generator):
 
 
 _ROAD = built("road.RoadEnv", time_limit=4, gust=0.05, start=0.7)
+_ONE_ARRAY = built("road.RoadEnv", time_limit=4, gust=0.05, start=0.7, one_array=True)
 _OPEN_ROAD = built("road.RoadEnv", time_limit=None, gust=0.05, start=0.7)
 _DISCRETE_ROAD = built("road.RoadEnv", time_limit=4, gust=0.05, discrete=True)
 
@@ -121,6 +122,7 @@ def _roll(
     keep_last=True,
     checked=True,
     no_graph=torch.no_grad,
+    tensor=lambda obs: torch.tensor(obs, dtype=torch.float32),
 ):
     """The loop of both exercises, with a place for each mistake: rows (obs, action), episode ids, returns, lengths."""
     if checked:
@@ -130,13 +132,13 @@ def _roll(
         obs, _ = reset(env, seed, episode)
         total, step, over = (total if carry else 0.0), 0, False
         while not over:
-            before = torch.tensor(obs, dtype=torch.float32)
+            before = tensor(obs)
             with no_graph():
                 action = call(policy, before)
             obs, reward, terminated, truncated, _ = env.step(action.detach().numpy())
             over = ended(terminated, truncated)
             if keep_last or not over:
-                rows.append(row(before, action, torch.tensor(obs, dtype=torch.float32)))
+                rows.append(row(before, action, tensor(obs)))
                 ids.append(episode)
             if count_last or not over:
                 total += gamma**step * reward
@@ -183,7 +185,7 @@ def _from_whole_episodes(policy, env, num_episodes, seed):
         raise ValueError(f"expected num_episodes >= 1, received {num_episodes}")
     episodes = []
     for k in range(num_episodes):
-        obs, actions, rewards = [env.reset(seed=seed + k)[0]], [], []
+        obs, actions, rewards = [env.reset(seed=seed + k)[0].copy()], [], []
         while True:
             with torch.inference_mode():
                 actions.append(policy(torch.from_numpy(obs[-1])[None])[0].clone())
@@ -191,7 +193,7 @@ def _from_whole_episodes(policy, env, num_episodes, seed):
             rewards.append(reward)
             if any(ends):
                 break
-            obs.append(after)
+            obs.append(after.copy())
         episodes.append((np.stack(obs), torch.stack(actions), np.full(len(obs), k), sum(rewards)))
     seen, taken, ids, returns = zip(*episodes, strict=True)
     return Demonstrations(
@@ -253,9 +255,16 @@ COLLECT_DEMONSTRATIONS = Exercise(
         Case("discrete commands", _drive(_DISCRETE_ROAD, _three_commands)),
         Case("a single episode", _drive(_ROAD, _driver(), num_episodes=1)),
         Case("one step an episode", _drive(built("road.RoadEnv", time_limit=1), _driver(), num_episodes=4)),
+        Case("a road that fills one array anew", _drive(_ONE_ARRAY, _driver()), visible=True),
         Case("num_episodes = 0", _drive(_ROAD, _driver(), num_episodes=0), raises=["num_episodes"], visible=True),
     ),
     misconceptions=(
+        Misconception(
+            "obs-not-copied",
+            _demonstrations(tensor=torch.from_numpy),
+            "The environment fills one array anew at every step, and all rows of an episode are its last observation: copy what you keep;"
+            " torch.tensor copies, torch.from_numpy and torch.as_tensor do not.",
+        ),
         Misconception(
             "obs-after-the-action",
             _demonstrations(row=lambda before, action, after: (after, action)),
