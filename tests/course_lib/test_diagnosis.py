@@ -6,7 +6,7 @@ import torch
 
 from autograder import freeze
 from autograder.spec import Case, Exercise, Misconception
-from course_lib import views
+from course_lib import validate, views
 from course_lib.cases import built
 from course_lib.diagnosis import diagnose, examine
 
@@ -200,3 +200,15 @@ def test_what_a_view_cannot_read_is_wrong_and_says_why(shuffle):
     for unreadable in (torch.arange(10.0), (torch.arange(10),), None):
         assert examine(shuffle, lambda count, generator, answer=unreadable: answer).state == "wrong"
     assert "indices must be int64" in examine(shuffle, lambda count, generator: torch.arange(10.0)).message
+
+
+@pytest.mark.parametrize(
+    ("message", "named"), [("math domain error", False), ("expected n >= 1", True), ("n=0", True), ("number", False)]
+)
+def test_an_argument_of_one_letter_is_named_by_a_word_of_its_own(message, named):
+    def refuses(n):
+        raise ValueError(message)
+
+    case = Case("n = 0", lambda generator: {"n": 0}, raises=["n"], visible=True)
+    exercise = Exercise("log", lambda n: validate.at_least_one(n=n), {"errors": 1.0}, (case,), (), {})
+    assert (examine(freeze.visible(exercise), refuses).state == "correct") == named

@@ -171,7 +171,8 @@ def test_environments_of_one_vector_differ_and_one_seed_decides_them():
 
 
 def test_timers_end_when_and_as_told():
-    envs = TimerVectorEnv(lengths=(1, 2), terminates=(True, False), action_reward=0.5)
+    envs = TimerVectorEnv(lengths=(1, 2), terminates=(True, False), action_reward=0.5, low=-0.3, high=0.8)
+    assert envs.single_action_space.low == np.float32(-0.3) and envs.single_action_space.high == np.float32(0.8)
     assert envs.observation_space.contains(envs.reset(seed=0)[0])
     first, second = (envs.step(np.array([[0.0], [1.0]])) for _ in range(2))
     assert (first[0].tolist(), first[2].tolist(), first[3].tolist()) == ([[0], [1]], [True, False], [False, False])

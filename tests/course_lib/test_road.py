@@ -29,6 +29,14 @@ def test_seeds_make_roads_and_gusts():
     assert (observations(1) == observations(1)).all() and (observations(1) != observations(2)).any()
 
 
+def test_a_road_with_one_array_shows_the_same_numbers_in_it():
+    plain, reusing = RoadEnv(), RoadEnv(one_array=True)
+    first, again = plain.reset(seed=3)[0], reusing.reset(seed=3)[0]
+    assert (first == again).all()
+    then, later = plain.step([0.5])[0], reusing.step([0.5])[0]
+    assert later is again and (then == later).all() and (first != then).any()
+
+
 def test_the_ends():
     env = RoadEnv(time_limit=3)
     env.reset(seed=0)
