@@ -1,7 +1,23 @@
-"""What every test may rely on: the programs of this environment (alembic, which nbgrader calls by name) come first on PATH."""
+"""What every test may rely on: the programs of this environment (alembic, which nbgrader calls by name) come first on PATH, and a
+browser. A missing browser is a failure: pages nobody has looked at are not tested."""
 
 import os
+import shutil
 import sys
 from pathlib import Path
 
+import pytest
+
 os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+
+
+@pytest.fixture(scope="module")  # Playwright's event loop runs as long as it does, and other tests have loops of their own
+def browser():
+    from playwright.sync_api import sync_playwright
+
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    assert chromium, "no Chromium found: run tools/system-packages, or `apt-get install chromium`, then test again"
+    with sync_playwright() as playwright:
+        running = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        yield running
+        running.close()

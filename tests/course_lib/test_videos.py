@@ -1,7 +1,6 @@
 """Videos are small, lie in the page itself, play when asked, and say in words what they show."""
 
 import re
-import shutil
 
 import gymnasium as gym
 import IPython.display
@@ -81,18 +80,13 @@ def test_the_page_gets_words_and_nothing_from_elsewhere(lander, monkeypatch):
     assert shown[0]["text/plain"] == "Video (first): It falls." and "<video" in shown[0]["text/html"]
 
 
-def test_a_browser_plays_it_from_a_file_when_asked(lander, tmp_path):
-    from playwright.sync_api import sync_playwright
-
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    assert chromium, "no Chromium found: run tools/system-packages, or `apt-get install chromium`, then test again"
+def test_a_browser_plays_it_from_a_file_when_asked(browser, lander, tmp_path):
     path, frames = lander
     words = "The lander falls and crashes."
     head = "<!doctype html><html lang=en><meta charset=utf-8><title>t</title><body>"
     (tmp_path / "page.html").write_text(head + videos.to_html((path, words, "first"), (path, words, "again")))
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        page = browser.new_context(offline=True, viewport={"width": 1000, "height": 700}).new_page()
+    with browser.new_context(offline=True, viewport={"width": 1000, "height": 700}) as context:
+        page = context.new_page()
         page.goto((tmp_path / "page.html").as_uri())
         video = page.get_by_label(words).first
         assert video.evaluate("v => v.paused && v.currentTime === 0 && v.readyState === 0"), "nothing plays or loads by itself"
@@ -106,4 +100,3 @@ def test_a_browser_plays_it_from_a_file_when_asked(lander, tmp_path):
         assert state[3] == pytest.approx(len(frames) / 25, abs=0.1)
         page.set_viewport_size({"width": 360, "height": 700})
         assert video.bounding_box()["width"] <= 360
-        browser.close()

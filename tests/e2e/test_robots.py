@@ -55,6 +55,7 @@ class Class:
         folder = self.hand_in(student, notebook)
         for module in (
             "autograder/__init__",
+            "autograder/mistakes",
             "autograder/spec",
             "autograder/checks/__init__",
             "autograder/checks/ch44",
