@@ -8,6 +8,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 WHOLE_MACHINE := tests/e2e tests/attacks tests/faults # they grade with a job for each core, under short time limits
 TWO_AT_A_TIME := $(WHOLE_MACHINE:%=--ignore=%)
+FILE_BY_FILE := -n 2 --dist loadfile --no-loadscope-reorder # sorted by the number of tests, the longest files would come last
 QUICK := $(TWO_AT_A_TIME) --ignore=tests/book --ignore=tests/autograder/test_killmatrix.py
 
 .PHONY: book release test check bench install clean
@@ -21,7 +22,7 @@ release: install
 test: install
 	tools/system-packages
 	status=0; \
-	$(BIN)/python -m pytest -n 2 --dist loadfile $(TWO_AT_A_TIME) || status=1; \
+	$(BIN)/python -m pytest $(FILE_BY_FILE) $(TWO_AT_A_TIME) || status=1; \
 	$(BIN)/python -m pytest $(WHOLE_MACHINE) || status=1; \
 	exit $$status
 
