@@ -27,6 +27,13 @@ class SquaredError:
         return (self.gain * outputs - actions).square().mean()
 
 
+class RowCount:
+    """A loss that tells how many rows it was given, for `loss_fn(outputs, actions)`; its gradient is 0."""
+
+    def __call__(self, outputs, actions):
+        return 0 * outputs.sum() + len(actions)
+
+
 class Clone(torch.nn.Module):
     """A network that imitates: two hidden layers (tanh) from an observation to the mean of normal actions, and one σ for all states.
 

@@ -1196,6 +1196,7 @@ BOOTSTRAP_INTERVAL = Exercise(
             **_SPARE,
         ),
         Case("no generator", replaced(_pattern(HALVES), generator=None), **_SPARE),
+        Case("a single resample: no width", _pattern(HALVES, num_resamples=1), view="width", visible=True, **_SPARE),
         Case("what is drawn from", _pattern(HALVES, num_resamples=20), returns=("generator",), view="drawn_from", visible=True),
         Case("single precision", _pattern(HALVES), dtype=torch.float32, visible=True, **_SPARE),
     ),
@@ -1269,6 +1270,11 @@ BOOTSTRAP_INTERVAL = Exercise(
             "ends-swapped",
             _bootstrap(finish=lambda scores, means, low, high: (high, low)),
             "The lower end comes first.",
+        ),
+        Misconception(
+            "num-resamples-ignored",
+            lambda scores, confidence=0.95, num_resamples=2000, generator=None: _bootstrap()(scores, confidence, 2000, generator),
+            "The number of resamples is fixed: draw num_resamples of them.",
         ),
         Misconception(
             "own-generator",

@@ -985,6 +985,12 @@ def _lines(generator):
     return drawn | {name: drawn[name].float() for name in ("obs", "actions")}
 
 
+def _counted(generator):
+    """Batches that one pass over the data fills, with a loss that is their size."""
+    drawn = _regression(batch_size=8, num_steps=3)(generator)
+    return drawn | {"loss_fn": built("demonstrations.RowCount")}
+
+
 def _descend(network, learning_rate):
     for weights in network.parameters():
         weights.data.sub_(weights.grad, alpha=learning_rate)
@@ -1100,6 +1106,7 @@ TRAIN_BC = Exercise(
         ),
         Case("a loss of twice the output", _regression(gain=2.0, num_steps=16), returns=_NETWORK, atol=0.6),
         Case("the losses on the way", _lines, view="training_curve", dtype=torch.float32, visible=True),
+        Case("a loss that counts the rows of its batch", _counted, dtype=torch.float32, visible=True),
         Case(
             "the generator is drawn from",
             _regression(batch_size=5, num_steps=2),
@@ -1128,6 +1135,11 @@ TRAIN_BC = Exercise(
             "uphill",
             _trained(loss=lambda loss_fn, outputs, actions: -loss_fn(outputs, actions), kept=lambda loss: -loss.detach()),
             "The loss grows: it is descended, not climbed, and a loss has its minus already.",
+        ),
+        Misconception(
+            "batch-size-ignored",
+            _trained(rows=lambda count, _batch_size, generator: torch.randperm(count, generator=generator)),
+            "Each step takes all rows: batch_size says how many a minibatch has.",
         ),
         Misconception(
             "first-minibatch-only",

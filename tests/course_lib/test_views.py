@@ -51,6 +51,13 @@ def test_what_is_no_epoch_is_refused(outputs):
         views.epochs(SIZES, outputs)
 
 
+def test_width_of_an_interval():
+    assert views.width({}, {"0": np.array(1.5), "1": np.array(4.0)})["width"] == 2.5
+    for unreadable in ({"0": np.array(1.0)}, {"0": np.array(1), "1": np.array(2)}, {"0": np.ones(1), "1": np.ones(1)}):
+        with pytest.raises(ValueError):
+            views.width({}, unreadable)
+
+
 def test_whether_a_generator_was_drawn_from():
     generator = torch.Generator().manual_seed(5)
     assert not views.drawn_from(SIZES, {"": generator.get_state().numpy()})["drawn"]
