@@ -137,7 +137,7 @@ def width(_arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) -> d
     """How far apart the two ends of an interval are: outputs "0" and "1", numbers each."""
     if sorted(outputs) != ["0", "1"] or any(end.ndim or end.dtype.kind != "f" for end in outputs.values()):
         raise ValueError("the interval must be two numbers, low and high")
-    return {"width": outputs["1"] - outputs["0"]}
+    return {"width": np.asarray(outputs["1"] - outputs["0"])}
 
 
 def until_the_end(_arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
