@@ -89,7 +89,7 @@ def sac_actor_loss(q1, q2, log_probs, alpha):
 
 
 def temperature_loss(log_alpha, log_probs, target_entropy):
-    """The temperature's loss: it rises while the policy's entropy is below the target.
+    """The temperature's loss: descending it raises alpha while the entropy is below the target.
 
         L = -mean(exp(log α) (log π(a|s) + H̄))
 
@@ -204,10 +204,10 @@ def repaired_transitions(obs, sent, rewards, next_obs, terminated, truncated, lo
 
 
 def fast_sac_update(agent, batch, settings, taught, generator):
-    """What course_lib.sac.update does, up to rounding, in half of its time.
+    """What course_lib.sac.update does, up to rounding, in three quarters of its time.
 
-    Three fifths of a plain update are not arithmetic on matrices but PyTorch's bookkeeping. So
-    the losses are differentiated on paper. With u = μ + σ ε, a = tanh u, B samples:
+    Much of a plain update is not arithmetic on matrices but PyTorch's bookkeeping. So the losses
+    are differentiated on paper. With u = μ + σ ε, a = tanh u, B samples:
 
         ∂L/∂Q = 2 (Q - y) / B for each critic,
         ∂L/∂u = [2 α a - (1 - a²) ∂min(Q₁, Q₂)/∂a] / B,
