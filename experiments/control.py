@@ -70,23 +70,27 @@ DEFAULT_EVERY = {"sac": 5_000, "ppo": 10_240}
 CHUNK = {"sac": 500, "ppo": 1}  # steps between looks at the clock; PPO's least is a rollout
 
 
-def _configuration(algorithm: str, place: str) -> dict[str, Any]:
-    settings: Any = SAC_SETTINGS[place] if algorithm == "sac" else PPO_SETTINGS[place]
+def configuration(algorithm: str, place: str, settings: Any) -> dict[str, Any]:
+    """What a record says of how its run was made."""
     chosen = {name: "infinity" if value == math.inf else value for name, value in asdict(settings).items()}
     about = {"algorithm": algorithm, "environment": ENVIRONMENTS[place], "evaluation_episodes": EPISODES}
     every = EVERY[algorithm].get(place, DEFAULT_EVERY[algorithm])
     return about | {"num_envs": 1 if algorithm == "sac" else NUM_ENVS, "every": every} | chosen
 
 
-VARIANTS = {f"{algorithm}_{place}": _configuration(algorithm, place) for place in ENVIRONMENTS for algorithm in ("sac", "ppo")}
+VARIANTS = {
+    f"{algorithm}_{place}": configuration(algorithm, place, settings[place])
+    for place in ENVIRONMENTS
+    for algorithm, settings in (("sac", SAC_SETTINGS), ("ppo", PPO_SETTINGS))
+}
 SEEDS = {variant: {"pendulum": 10, "hopper": 5}.get(variant.partition("_")[2], 3) for variant in VARIANTS}
 
 
 class SACRun:
     """SAC in one environment, as `run` advances it."""
 
-    def __init__(self, place: str, seed: int):
-        self.settings = SAC_SETTINGS[place]
+    def __init__(self, place: str, seed: int, settings: SACSettings | None = None):
+        self.settings = settings or SAC_SETTINGS[place]
         taught = sac.Taught.of(vars(ch48))
         self.training = sac.Training(gym.make(ENVIRONMENTS[place]), self.settings, seed, taught, ch48.fast_sac_update)
         self.best_action = self.training.agent.best_action
