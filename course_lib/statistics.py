@@ -1,4 +1,7 @@
-"""Summaries over seeds: the interquartile mean and its bootstrap interval (Agarwal et al., 2021, https://arxiv.org/abs/2108.13264)."""
+"""Summaries over seeds: the interquartile mean, the probability of improvement, and their bootstrap intervals.
+
+After Agarwal et al. (2021), https://arxiv.org/abs/2108.13264.
+"""
 
 from __future__ import annotations
 
@@ -31,6 +34,26 @@ def summarise(scores, confidence=0.95, num_resamples=1000, seed=0):
     resampled = middle_mean(np.concatenate(picks))
     low, high = np.quantile(resampled, [(1 - confidence) / 2, (1 + confidence) / 2], axis=0)
     return middle_mean(np.concatenate(tasks)), low, high
+
+
+def probability_of_improvement(x, y, confidence=0.95, num_resamples=2000, seed=0):
+    """How often a run of x scores higher than one of y, ties counted as half, over all pairs.
+
+    Args:
+      x, y: scores, (seeds,) each; the numbers of seeds may differ.
+      confidence: mass of the interval, in (0, 1).
+      num_resamples: bootstrap samples of the seeds, of x and y apart.
+      seed: of the resampling.
+
+    Returns: (share, low, high), with a percentile bootstrap interval.
+    """
+    x, y = (np.asarray(scores, dtype=float) for scores in (x, y))
+    wins = (np.sign(x[:, None] - y) + 1) / 2
+    generator = np.random.default_rng(seed)
+    rows, columns = (generator.integers(len(scores), size=(num_resamples, len(scores))) for scores in (x, y))
+    resampled = wins[rows[:, :, None], columns[:, None]].mean(axis=(1, 2))
+    low, high = np.quantile(resampled, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return wins.mean(), low, high
 
 
 def interval(scores, digits=0):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from course_lib.statistics import interval, middle_mean, summarise, table
+from course_lib.statistics import interval, middle_mean, probability_of_improvement, summarise, table
 
 
 def test_middle_mean_drops_a_quarter_at_each_end():
@@ -41,6 +41,22 @@ def test_tasks_are_resampled_apart():
     assert (centre, low, high) == pytest.approx((4, 4, 4))
     _, low, high = summarise(np.array([0.0] * 4 + [8.0] * 4))
     assert low < 4 < high
+
+
+def test_the_probability_of_improvement_counts_pairs_and_half_of_each_tie():
+    # of six pairs 3 beats both of 1 and 2, 1 ties with 1 and loses to 2, 0 loses twice
+    assert probability_of_improvement([3.0, 1.0, 0.0], [1.0, 2.0])[0] == pytest.approx(2.5 / 6)
+    assert probability_of_improvement([1.0, 2.0], [3.0, 1.0, 0.0])[0] == pytest.approx(3.5 / 6)
+
+
+def test_the_interval_of_the_probability_of_improvement_resamples_both_sides():
+    assert probability_of_improvement(np.arange(5.0) + 10, np.arange(5.0)) == (1, 1, 1)
+    one_seed, ten_seeds = np.array([4.5]), np.arange(10.0)
+    _, low, high = probability_of_improvement(one_seed, ten_seeds)
+    assert 0 < low < 0.5 < high < 1
+    assert probability_of_improvement(ten_seeds, one_seed)[1:] == pytest.approx((low, high), abs=0.2)
+    _, lower, higher = probability_of_improvement(one_seed, ten_seeds, confidence=0.5)
+    assert low < lower <= 0.5 <= higher < high
 
 
 def test_tables_are_aligned():
