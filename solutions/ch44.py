@@ -88,7 +88,8 @@ def normalize_advantages(advantages, eps=1e-8):
 
         (A - mean(A)) / (std(A) + ε)
 
-    Andrychowicz et al. (2021), section 3.3, https://arxiv.org/abs/2006.05990
+    Huang et al. (2022), detail 7, where it is done in each minibatch anew:
+    https://iclr-blog-track.github.io/2022/03/25/ppo-implementation-details/
 
     Args:
       advantages: any shape, at least two elements.
