@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -81,3 +82,9 @@ def test_checks_without_a_stub_and_criteria_that_do_not_add_up_are_refused(tiny)
 def test_every_chapter_of_the_book_keeps_its_contract():
     for real in chapter.all_chapters():
         assemble.verify(real)
+
+
+def test_every_chapter_names_the_experiments_whose_records_it_loads_because_only_those_are_released():
+    for real in chapter.all_chapters():
+        loaded = {name for cell in real.cells for name in re.findall(r'records\.load\("(\w+)"', cell.source)}
+        assert loaded <= set(real.experiments), real.assignment
