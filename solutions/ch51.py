@@ -14,7 +14,8 @@ def gaussian_nll(mean, log_var, targets):
 
         L = mean(½ [log σ² + (y - μ)² / σ² + log 2π]),   σ² = exp(log_var)
 
-    over members, samples and dimensions; so every member learns as if it were alone.
+    over members, samples and dimensions; so each member learns from its own loss alone, up
+    to a factor 1/E.
     Chua et al. (2018), section 4, https://arxiv.org/abs/1805.12114
 
     Args:
