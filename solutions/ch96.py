@@ -70,7 +70,7 @@ def best_of_n_kl(n):
         log n - (n - 1) / n
 
     Exact where no two candidates have one score, an upper bound otherwise.
-    Beirami et al. (2024), https://arxiv.org/abs/2401.01879
+    Beirami et al. (2025), https://arxiv.org/abs/2401.01879
 
     Args:
       n: number of candidates, at least 1.
