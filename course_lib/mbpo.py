@@ -86,7 +86,7 @@ ENDED = {"Pendulum-v1": never, "HalfCheetah-v5": never, "Hopper-v5": hopper_ende
 
 
 class Ensemble:
-    """A model of the world, as `imagine` calls it: networks that were trained apart and disagree where they have seen little.
+    """A model of the world, as `imagine` calls it: networks that were trained apart, each with its own errors.
 
     Args:
       obs_dim, action_dim: O, A.
