@@ -3,7 +3,8 @@
 # make bench   how fast are the grader, beside stock nbgrader, PPO and SAC, beside Stable-Baselines3, and DPO, beside TRL (installs both)
 # The environment is .venv; it is brought up to date whenever the pins or pyproject.toml change.
 
-PYTHON ?= $(shell command -v python3.11 || command -v python3)
+PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v python3.13 || command -v python3)
+SHELL := /bin/bash -o pipefail
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 WHOLE_MACHINE := tests/e2e tests/attacks tests/faults # they grade with a job for each core, under short time limits
@@ -42,14 +43,16 @@ bench: install
 install: $(INSTALLED)
 
 $(INSTALLED): requirements.txt constraints.txt pyproject.toml
-	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null || { \
-	  echo "This course is pinned to Python 3.11, and '$(PYTHON)' is another version or missing."; \
-	  echo "Install 3.11 (Debian, Ubuntu: apt-get install python3.11-venv; or use pyenv, conda or uv), or name it: make PYTHON=/path/to/python3.11"; \
+	@"$(PYTHON)" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null || { \
+	  echo "This course needs Python 3.11, 3.12 or 3.13, and '$(PYTHON)' is another version or missing."; \
+	  echo "Install one (Debian, Ubuntu: apt-get install python3-venv; or use pyenv, conda or uv), or name it: make PYTHON=/path/to/python3.12"; \
 	  exit 1; }
+	@echo "Setting up .venv with $$("$(PYTHON)" --version): the pinned packages come from the package index, 1 to 5 GB, in 2 to 10 minutes."
 	"$(PYTHON)" -m venv .venv
-	$(BIN)/python -m pip install --quiet -r requirements.txt
+	$(BIN)/python -m pip install --progress-bar off -r requirements.txt | grep --line-buffered -E '^(Collecting|Installing|Successfully)' | cut -c1-110
 	$(BIN)/python -m pip install --quiet --no-deps -e .
-	touch $@
+	@touch $@
+	@echo "Set up. 'make book' builds the book, 'make test' proves it."
 
 clean:
 	rm -rf book/_build book/_stage book/_cache course_lib/frozen test-artefacts build *.egg-info

@@ -17,6 +17,7 @@ from rich.table import Table
 from autograder import sandbox
 
 ROOT = Path(__file__).resolve().parents[1]
+PYTHONS = (3, 11), (3, 13)  # the oldest and the newest that the pins are tried with
 NEEDED_DISK = 2 << 30  # bytes: a built book, a gradebook, the reports of a class
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
@@ -34,7 +35,18 @@ class Check:
 
 def checks() -> list[Check]:
     """Looks at everything, the quick things first; a few seconds, most of them for importing torch inside the sandbox."""
-    looks: tuple[Callable[[], Check], ...] = (_python, _packages, _torch, _sandbox, _flights, _nbgrader, _frozen, _disk, _browser)
+    looks: tuple[Callable[[], Check], ...] = (
+        _python,
+        _packages,
+        _torch,
+        _mujoco,
+        _sandbox,
+        _flights,
+        _nbgrader,
+        _frozen,
+        _disk,
+        _browser,
+    )
     return [look() for look in looks]
 
 
@@ -50,8 +62,8 @@ def report(console: Console | None = None) -> int:
 
 
 def _python() -> Check:
-    ok = sys.version_info[:2] == (3, 11)
-    return Check("Python", ok, platform.python_version(), "" if ok else "Make the environment with Python 3.11.")
+    ok = PYTHONS[0] <= sys.version_info[:2] <= PYTHONS[1]
+    return Check("Python", ok, platform.python_version(), "" if ok else "Make the environment with Python 3.11, 3.12 or 3.13.")
 
 
 def _packages() -> Check:
@@ -86,6 +98,18 @@ def _torch() -> Check:
     except Exception as error:
         return Check("torch", False, f"{type(error).__name__}: {error}"[:300], "pip install -r requirements.txt")
     return Check("torch", ok, f"{torch.__version__}, {torch.get_num_threads()} threads")
+
+
+def _mujoco() -> Check:
+    """MuJoCo 4 is three packages: pip takes the core's files away again when it upgrades MuJoCo 3, and calls that a success."""
+    try:
+        import mujoco
+
+        mujoco.MjModel.from_xml_string("<mujoco/>")
+    except Exception as error:
+        mend = "pip install --force-reinstall --no-deps mujoco mujoco-core mujoco-studio (MuJoCo 3 was upgraded in place)"
+        return Check("MuJoCo", False, f"{type(error).__name__}: {error}"[:300], mend)
+    return Check("MuJoCo", True, mujoco.__version__)
 
 
 def _sandbox() -> Check:

@@ -10,7 +10,6 @@ import hashlib
 import io
 import json
 import os
-import re
 import tempfile
 import tomllib
 import zipfile
@@ -26,19 +25,20 @@ from autograder.chapter import ANSWER_LINE, Chapter
 from autograder.contract import STUB, Sources
 from autograder.contract import sources as real_sources
 
-LEARNERS_NEED = {
-    "torch",
-    "numpy",
-    "matplotlib",
-    "ipywidgets",
-    "gymnasium[box2d]",
-    "safetensors",
-    "pyarrow",
-    "threadpoolctl",
-    "tqdm",
-    "transformers",
-    "vaderSentiment",
+LEARNERS_NEED = {  # the oldest versions that will do: a learner's Jupyter, or Colab, brings its own
+    "torch": "2.6",
+    "numpy": "2.0",
+    "matplotlib": "3.10",
+    "ipywidgets": "7.7.1",
+    "gymnasium": "1.2",
+    "safetensors": "0.5",
+    "pyarrow": "18",
+    "threadpoolctl": "3.5",
+    "tqdm": "4.67",
+    "transformers": "4.57",
+    "vaderSentiment": "3.3.2",
 }
+FLIGHT_NEEDS = {"Box2D": "2.3.10", "pygame-ce": "2.5"}  # chapters that fly; Box2D has no wheel for Python 3.14
 RECORDED = {".parquet", ".mp4", ".webp"}  # not policies: one could be handed in
 MANIFEST = ".release.json"
 
@@ -133,12 +133,13 @@ def _library(chosen: list[Chapter], sources: Callable[[Chapter], Sources]) -> di
 
 
 def _pyproject() -> str:
-    """The library's own project file: our pins as lower bounds, as a learner's Jupyter brings versions of its own."""
-    pins = re.findall(r"^([\w-]+)(?:\[.*\])?==(\S+)", (paths.ROOT / "requirements.txt").read_text(encoding="utf-8"), re.MULTILINE)
-    needed = [f"{need}>={version}" for name, version in pins for need in LEARNERS_NEED if need.partition("[")[0] == name]
+    """The library's own project file."""
     project = tomllib.loads((paths.ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    needed, for_flight = (
+        json.dumps([f"{name}>={version}" for name, version in needs.items()]) for needs in (LEARNERS_NEED, FLIGHT_NEEDS)
+    )
     python = project["requires-python"].split(",")[0]
-    return _PYPROJECT.format(version=project["version"], python=python, dependencies=json.dumps(needed))
+    return _PYPROJECT.format(version=project["version"], python=python, dependencies=needed, flight=for_flight)
 
 
 def _place(path: Path, ours: Iterable[str]) -> Path:
@@ -212,12 +213,15 @@ In this folder, with Python 3.11 or newer:
 
     python -m venv .venv
     . .venv/bin/activate            # on Windows: .venv\\Scripts\\activate
-    pip install ./course_lib jupyterlab
+    pip install "./course_lib[flight]" jupyterlab
     jupyter lab {example}
+
+`[flight]` brings Box2D, in which chapters 45 and 74 fly. Box2D has no wheel for Python 3.14: leave `[flight]` out there, and every
+other chapter works. PyTorch no longer builds for Macs with an Intel processor: there, Colab is the way.
 
 In Google Colab: upload `course.zip`, open the notebook, and run this in a first cell:
 
-    !unzip -oq course.zip && pip install -q ./course_lib
+    !unzip -oq course.zip && pip install -q "./course_lib[flight]"
 
 ## Work
 
@@ -239,6 +243,9 @@ version = "{version}"
 description = "What the notebooks of the policy optimisation course import"
 requires-python = "{python}"
 dependencies = {dependencies}
+
+[project.optional-dependencies]
+flight = {flight}
 
 [tool.setuptools.packages.find]
 include = ["course_lib*"]

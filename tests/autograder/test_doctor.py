@@ -1,6 +1,7 @@
 """The doctor is quiet on a working machine, names what is broken on another, and its exit status tells the two apart."""
 
 import io
+import sys
 
 import pytest
 from rich.console import Console
@@ -12,7 +13,18 @@ from autograder.doctor import Check
 def test_this_machine_works():
     found = {check.name: check for check in doctor.checks()}
     assert [check for check in found.values() if check.required and not check.ok] == []
-    assert list(found) == ["Python", "packages", "torch", "sandbox", "flights", "nbgrader", "frozen checks", "disk", "browser"]
+    assert list(found) == [
+        "Python",
+        "packages",
+        "torch",
+        "MuJoCo",
+        "sandbox",
+        "flights",
+        "nbgrader",
+        "frozen checks",
+        "disk",
+        "browser",
+    ]
     assert all(check.ok or check.remedy for check in found.values())
 
 
@@ -50,6 +62,23 @@ def test_a_missing_engine_is_reported(monkeypatch):
     monkeypatch.setattr("gymnasium.make", lambda *_, **__: 1 / 0)
     check = doctor._flights()
     assert not check.ok and "ZeroDivisionError" in check.detail and check.remedy
+
+
+def test_a_mujoco_that_lost_its_core_in_an_upgrade_comes_with_the_mend(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)  # importing it raises ImportError, as it does then
+    check = doctor._mujoco()
+    assert (
+        not check.ok
+        and "ModuleNotFoundError" in check.detail
+        and "--force-reinstall --no-deps mujoco mujoco-core" in check.remedy
+    )
+
+
+@pytest.mark.parametrize(("version", "ok"), [((3, 10), False), ((3, 11), True), ((3, 13), True), ((3, 14), False)])
+def test_three_versions_of_python_will_do(monkeypatch, version, ok):
+    monkeypatch.setattr(sys, "version_info", version)
+    check = doctor._python()
+    assert check.ok is ok and ("3.12" in check.remedy) is not ok
 
 
 @pytest.mark.parametrize("look", [doctor._nbgrader, doctor._browser])

@@ -8,6 +8,8 @@ import zipfile
 
 import nbformat
 import pytest
+from packaging.utils import canonicalize_name
+from packaging.version import Version
 
 from autograder import release
 from autograder.chapter import all_chapters
@@ -160,7 +162,16 @@ def test_the_library_installs_with_its_frozen_checks_and_without_the_project(bun
     ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert ran.stdout.strip() == f"{tmp_path}/course_lib/checking.py ['double', 'quadruple']"
     metadata = next(tmp_path.glob("course_lib-*.dist-info/METADATA")).read_text()
-    assert set(re.findall(r"Requires-Dist: ([\w-]+(?:\[.*\])?)>=", metadata)) == release.LEARNERS_NEED
+    required = re.findall(r"Requires-Dist: ([\w-]+)>=(\S+?)(; extra == .flight.)?$", metadata, re.MULTILINE)
+    assert {name: version for name, version, extra in required if not extra} == release.LEARNERS_NEED
+    assert {name: version for name, version, extra in required if extra} == release.FLIGHT_NEEDS
+
+
+def test_the_pins_are_no_older_than_what_learners_need():
+    lists = "\n".join((release.paths.ROOT / name).read_text() for name in ("requirements.txt", "constraints.txt"))
+    pins = {canonicalize_name(name): version for name, version in re.findall(r"^([\w-]+)(?:\[.*\])?==(\S+)", lists, re.MULTILINE)}
+    for name, oldest in (release.LEARNERS_NEED | release.FLIGHT_NEEDS).items():
+        assert Version(pins[canonicalize_name(name)]) >= Version(oldest), name
 
 
 def test_no_line_of_a_tiny_solution_and_no_name_of_the_judge_is_in_the_bundle(bundle):
