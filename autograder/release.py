@@ -38,7 +38,7 @@ LEARNERS_NEED = {  # the oldest versions that will do: a learner's Jupyter, or C
     "transformers": "4.57",
     "vaderSentiment": "3.3.2",
 }
-FLIGHT_NEEDS = {"Box2D": "2.3.10", "pygame-ce": "2.5"}  # chapters that fly; Box2D has no wheel for Python 3.14
+FLIGHT_NEEDS = {"Box2D": "2.3.10", "pygame-ce": "2.5"}  # chapters that fly; Box2D has no wheel for Python 3.14, and none for Linux on ARM
 RECORDED = {".parquet", ".mp4", ".webp"}  # not policies: one could be handed in
 MANIFEST = ".release.json"
 
@@ -216,8 +216,8 @@ In this folder, with Python 3.11 or newer:
     pip install "./course_lib[flight]" jupyterlab
     jupyter lab {example}
 
-`[flight]` brings Box2D, in which chapters 45 and 74 fly. Box2D has no wheel for Python 3.14: leave `[flight]` out there, and every
-other chapter works. PyTorch no longer builds for Macs with an Intel processor: there, Colab is the way.
+`[flight]` brings Box2D, in which chapters 45 and 74 fly. Box2D has no wheel for Python 3.14, and none for Linux on ARM: leave `[flight]`
+out there, and every other chapter works. PyTorch no longer builds for Macs with an Intel processor: there, Colab is the way.
 
 In Google Colab: upload `course.zip`, open the notebook, and run this in a first cell:
 
