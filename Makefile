@@ -30,6 +30,7 @@ test: install
 check: install
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+	$(BIN)/python tools/format-chapters --check
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -q $(QUICK)
 

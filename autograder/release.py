@@ -38,7 +38,8 @@ LEARNERS_NEED = {  # the oldest versions that will do: a learner's Jupyter, or C
     "transformers": "4.57",
     "vaderSentiment": "3.3.2",
 }
-FLIGHT_NEEDS = {"Box2D": "2.3.10", "pygame-ce": "2.5"}  # chapters that fly; Box2D has no wheel for Python 3.14, and none for Linux on ARM
+# of chapters that fly; Box2D has no wheel for Python 3.14, and none for Linux on ARM
+FLIGHT_NEEDS = {"Box2D": "2.3.10", "pygame-ce": "2.5"}
 RECORDED = {".parquet", ".mp4", ".webp"}  # not policies: one could be handed in
 MANIFEST = ".release.json"
 

@@ -1,4 +1,6 @@
-"""Reference solutions of chapter 44: generalised advantage estimation and what PPO builds on it."""
+"""Reference solutions of chapter 44: generalised advantage estimation and what PPO builds
+on it.
+"""
 
 from __future__ import annotations
 
@@ -25,12 +27,16 @@ def td_residuals(rewards, values, next_values, terminated, gamma=0.99):
     Returns: (T, N) residuals in units of reward, without a graph.
     Raises: ValueError if the shapes differ or gamma lies outside [0, 1].
     """
-    validate.same_shape(rewards=rewards, values=values, next_values=next_values, terminated=terminated)
+    validate.same_shape(
+        rewards=rewards, values=values, next_values=next_values, terminated=terminated
+    )
     validate.unit_interval(gamma=gamma)
     return (rewards + gamma * next_values * ~terminated - values).detach()
 
 
-def compute_gae(rewards, values, next_values, terminated, truncated, gamma=0.99, gae_lambda=0.95):
+def compute_gae(
+    rewards, values, next_values, terminated, truncated, gamma=0.99, gae_lambda=0.95
+):
     """Generalised advantage estimates, by one backward pass over time.
 
         A_t = δ_t + γ λ (1 - ended_t) A_{t+1},   ended_t = terminated_t or truncated_t
@@ -52,7 +58,13 @@ def compute_gae(rewards, values, next_values, terminated, truncated, gamma=0.99,
     Returns: (T, N) advantages in units of reward, without a graph.
     Raises: ValueError if shapes differ, or gamma or gae_lambda lies outside [0, 1].
     """
-    validate.same_shape(rewards=rewards, values=values, next_values=next_values, terminated=terminated, truncated=truncated)
+    validate.same_shape(
+        rewards=rewards,
+        values=values,
+        next_values=next_values,
+        terminated=terminated,
+        truncated=truncated,
+    )
     validate.unit_interval(gamma=gamma, gae_lambda=gae_lambda)
     deltas = td_residuals(rewards, values, next_values, terminated, gamma)
     ended = terminated | truncated
@@ -118,10 +130,14 @@ def explained_variance(values, returns):
     validate.same_shape(values=values, returns=returns)
     variance = returns.var()
     explained = 1 - (returns - values).var() / variance
-    return torch.where(variance == 0, torch.full_like(explained, float("nan")), explained).detach()
+    return torch.where(
+        variance == 0, torch.full_like(explained, float("nan")), explained
+    ).detach()
 
 
-def repaired_targets(rewards, values, next_values, terminated, truncated, gamma=0.99, gae_lambda=0.95):
+def repaired_targets(
+    rewards, values, next_values, terminated, truncated, gamma=0.99, gae_lambda=0.95
+):
     """What the suspect program should have fed to its two losses.
 
     Args:
@@ -133,5 +149,7 @@ def repaired_targets(rewards, values, next_values, terminated, truncated, gamma=
       advantages, normalised over all elements; for the critic's loss its targets.
     Raises: ValueError if shapes differ, or gamma or gae_lambda lies outside [0, 1].
     """
-    advantages = compute_gae(rewards, values, next_values, terminated, truncated, gamma, gae_lambda)
+    advantages = compute_gae(
+        rewards, values, next_values, terminated, truncated, gamma, gae_lambda
+    )
     return normalize_advantages(advantages), lambda_returns(advantages, values)

@@ -1,4 +1,6 @@
-"""Reference solutions of chapter 45: PPO, from the log-probability of an action to an agent that lands."""
+"""Reference solutions of chapter 45: PPO, from the log-probability of an action to an
+agent that lands.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,19 @@ import torch
 from course_lib import validate
 from course_lib.policies import Adam, Categorical, policy_for
 from course_lib.ppo import Batch
-from course_lib.rollouts import EpisodeReturns, Rollout, require_same_step_autoreset, true_next_obs
+from course_lib.rollouts import (
+    EpisodeReturns,
+    Rollout,
+    require_same_step_autoreset,
+    true_next_obs,
+)
 from course_lib.seeding import seed_everything
-from solutions.ch44 import compute_gae, explained_variance, lambda_returns, normalize_advantages
+from solutions.ch44 import (
+    compute_gae,
+    explained_variance,
+    lambda_returns,
+    normalize_advantages,
+)
 
 
 def gaussian_log_prob(mean, log_std, actions):
@@ -32,7 +44,10 @@ def gaussian_log_prob(mean, log_std, actions):
       nor (B, A).
     """
     validate.same_shape(mean=mean, actions=actions)
-    validate.same_shape(mean=mean, log_std=log_std.expand_as(mean) if log_std.shape == mean.shape[-1:] else log_std)
+    validate.same_shape(
+        mean=mean,
+        log_std=log_std.expand_as(mean) if log_std.shape == mean.shape[-1:] else log_std,
+    )
     scaled = (actions.detach() - mean) * (-log_std).exp()
     return -(0.5 * scaled.square() + log_std + 0.5 * math.log(2 * math.pi)).sum(-1)
 
@@ -96,12 +111,20 @@ def collect_rollout(envs, policy, num_steps, obs, generator):
     for _ in range(num_steps):
         before = torch.as_tensor(obs, dtype=torch.float32)
         actions = policy.act(before, generator)
-        clipped = actions.numpy() if actions.dtype == torch.int64 else actions.numpy().clip(bounds.low, bounds.high)
+        clipped = (
+            actions.numpy()
+            if actions.dtype == torch.int64
+            else actions.numpy().clip(bounds.low, bounds.high)
+        )
         obs, rewards, terminated, truncated, info = envs.step(clipped)
-        steps.append((before, actions, rewards, true_next_obs(obs, info), terminated, truncated))
+        steps.append(
+            (before, actions, rewards, true_next_obs(obs, info), terminated, truncated)
+        )
     columns = [torch.as_tensor(np.stack(column)) for column in zip(*steps, strict=True)]
     columns.append(torch.as_tensor(obs))
-    return Rollout(*(column.float() if column.is_floating_point() else column for column in columns))
+    return Rollout(
+        *(column.float() if column.is_floating_point() else column for column in columns)
+    )
 
 
 def minibatches(batch_size, minibatch_size, generator):
@@ -121,7 +144,17 @@ def minibatches(batch_size, minibatch_size, generator):
     return iter(torch.randperm(batch_size, generator=generator).split(minibatch_size))
 
 
-def ppo_loss(log_probs, old_log_probs, advantages, values, returns, entropy, clip_range, vf_coef, ent_coef):
+def ppo_loss(
+    log_probs,
+    old_log_probs,
+    advantages,
+    values,
+    returns,
+    entropy,
+    clip_range,
+    vf_coef,
+    ent_coef,
+):
     """PPO's loss: the clipped surrogate, the critic's squared error, and a bonus for entropy.
 
         L = -mean(min(ρ A, clip(ρ, 1 - ε, 1 + ε) A)) + c_v mean((V - R)²) - c_e mean(H)
@@ -144,7 +177,13 @@ def ppo_loss(log_probs, old_log_probs, advantages, values, returns, entropy, cli
     Raises: ValueError if the shapes of all but entropy differ, entropy is neither (B,) nor
       (), or clip_range < 0.
     """
-    validate.same_shape(log_probs=log_probs, old_log_probs=old_log_probs, advantages=advantages, values=values, returns=returns)
+    validate.same_shape(
+        log_probs=log_probs,
+        old_log_probs=old_log_probs,
+        advantages=advantages,
+        values=values,
+        returns=returns,
+    )
     if entropy.dim():
         validate.same_shape(entropy=entropy, log_probs=log_probs)
     validate.non_negative(clip_range=clip_range)
@@ -192,17 +231,29 @@ def ppo_update(policy, optimizer, batch, settings, generator):
             rows = batch[indices]
             log_probs, entropy, values = evaluate_actions(policy, rows.obs, rows.actions)
             loss, metrics = ppo_loss(
-                log_probs, rows.old_log_probs, rows.advantages, values, rows.returns, entropy,
-                settings.clip_range, settings.vf_coef, settings.ent_coef,
-            )  # fmt: skip
+                log_probs,
+                rows.old_log_probs,
+                rows.advantages,
+                values,
+                rows.returns,
+                entropy,
+                settings.clip_range,
+                settings.vf_coef,
+                settings.ent_coef,
+            )
             policy.weights.grad = None
             loss.backward()
             optimizer.step(policy, settings.max_grad_norm)
             epoch.append(metrics)
         history += epoch
-        if torch.stack([metrics["approx_kl"] for metrics in epoch]).mean() > settings.target_kl:
+        if (
+            torch.stack([metrics["approx_kl"] for metrics in epoch]).mean()
+            > settings.target_kl
+        ):
             break
-    return {name: torch.stack([metrics[name] for metrics in history]).mean() for name in history[0]}
+    return {
+        name: torch.stack([metrics[name] for metrics in history]).mean() for name in history[0]
+    }
 
 
 def estimate(policy, rollout, settings, reward=None):
@@ -217,19 +268,36 @@ def estimate(policy, rollout, settings, reward=None):
 
     Returns: (Batch of T N rows, explained variance of the values).
     """
-    rewards = rollout.rewards if reward is None else reward(rollout.obs, rollout.actions, rollout.next_obs)
+    rewards = (
+        rollout.rewards
+        if reward is None
+        else reward(rollout.obs, rollout.actions, rollout.next_obs)
+    )
     with torch.no_grad():
-        log_probs, _, values = evaluate_actions(policy, rollout.obs.flatten(0, 1), rollout.actions.flatten(0, 1))
+        log_probs, _, values = evaluate_actions(
+            policy, rollout.obs.flatten(0, 1), rollout.actions.flatten(0, 1)
+        )
     values, next_values = values.view_as(rewards), policy.value(rollout.next_obs)
     advantages = compute_gae(
-        settings.reward_scale * rewards, values, next_values, rollout.terminated, rollout.truncated,
-        settings.gamma, settings.gae_lambda,
-    )  # fmt: skip
+        settings.reward_scale * rewards,
+        values,
+        next_values,
+        rollout.terminated,
+        rollout.truncated,
+        settings.gamma,
+        settings.gae_lambda,
+    )
     returns = lambda_returns(advantages, values)
     explained = explained_variance(values, returns)
     if settings.normalize_advantages:
         advantages = normalize_advantages(advantages)
-    batch = Batch(rollout.obs.flatten(0, 1), rollout.actions.flatten(0, 1), log_probs, advantages.flatten(), returns.flatten())
+    batch = Batch(
+        rollout.obs.flatten(0, 1),
+        rollout.actions.flatten(0, 1),
+        log_probs,
+        advantages.flatten(),
+        returns.flatten(),
+    )
     return batch, explained
 
 
@@ -303,13 +371,20 @@ def repaired_rollout(envs, policy, num_steps, obs, generator):
     bounds = envs.single_action_space
     steps = []
     for _ in range(num_steps):
-        before = torch.as_tensor(obs, dtype=torch.float32).clone()  # the next step overwrites what obs holds
+        # the next step overwrites what obs holds
+        before = torch.as_tensor(obs, dtype=torch.float32).clone()
         actions = policy.act(before, generator)
-        obs, rewards, terminated, truncated, info = envs.step(actions.numpy().clip(bounds.low, bounds.high))
-        steps.append((before, actions, rewards, true_next_obs(obs, info), terminated, truncated))
+        obs, rewards, terminated, truncated, info = envs.step(
+            actions.numpy().clip(bounds.low, bounds.high)
+        )
+        steps.append(
+            (before, actions, rewards, true_next_obs(obs, info), terminated, truncated)
+        )
     columns = [torch.as_tensor(np.stack(column)) for column in zip(*steps, strict=True)]
     columns.append(torch.as_tensor(obs).clone())
-    return Rollout(*(column.float() if column.is_floating_point() else column for column in columns))
+    return Rollout(
+        *(column.float() if column.is_floating_point() else column for column in columns)
+    )
 
 
 def fast_ppo_update(policy, optimizer, batch, settings, generator):
@@ -326,16 +401,28 @@ def fast_ppo_update(policy, optimizer, batch, settings, generator):
 
     Args, returns: as ppo_update.
     """
-    columns = [column.numpy() for column in (batch.obs, batch.actions, batch.old_log_probs, batch.advantages, batch.returns)]
+    columns = [
+        column.numpy()
+        for column in (
+            batch.obs,
+            batch.actions,
+            batch.old_log_probs,
+            batch.advantages,
+            batch.returns,
+        )
+    ]
     columns[0] = policy.normalize(columns[0])
     head = categorical_head if policy.discrete else gaussian_head
     history: list[list[float]] = []
-    policy.weights.grad = torch.from_numpy(policy.gradient)  # one memory: what `backward` writes is what `step` reads
+    # one memory: what `backward` writes is what `step` reads
+    policy.weights.grad = torch.from_numpy(policy.gradient)
     for _ in range(settings.num_epochs):
         epoch = []
         for indices in minibatches(len(batch), settings.minibatch_size, generator):
             rows = indices.numpy()
-            obs, actions, old_log_probs, advantages, returns = (column[rows] for column in columns)
+            obs, actions, old_log_probs, advantages, returns = (
+                column[rows] for column in columns
+            )
             actor, critic = policy.forward("actor", obs), policy.forward("critic", obs)
             log_probs, entropy, pull_back = head(policy, actor[-1], actions)
             (policy_loss, approx_kl, clip_fraction), d_log_probs = clipped_surrogate_gradient(
@@ -345,12 +432,22 @@ def fast_ppo_update(policy, optimizer, batch, settings, generator):
             policy.backward("actor", actor, pull_back(d_log_probs, -settings.ent_coef))
             policy.backward("critic", critic, (2 * settings.vf_coef / len(errors)) * errors)
             optimizer.step(policy, settings.max_grad_norm)
-            epoch.append([policy_loss, np.vdot(errors, errors) / len(errors), entropy, approx_kl, clip_fraction])
+            epoch.append(
+                [
+                    policy_loss,
+                    np.vdot(errors, errors) / len(errors),
+                    entropy,
+                    approx_kl,
+                    clip_fraction,
+                ]
+            )
         history += epoch
         if np.mean([metrics[3] for metrics in epoch]) > settings.target_kl:
             break
     names = "policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction"
-    return dict(zip(names, torch.from_numpy(np.mean(history, axis=0, dtype=np.float32)), strict=True))
+    return dict(
+        zip(names, torch.from_numpy(np.mean(history, axis=0, dtype=np.float32)), strict=True)
+    )
 
 
 def clipped_surrogate_gradient(log_probs, old_log_probs, advantages, clip_range):
@@ -366,7 +463,11 @@ def clipped_surrogate_gradient(log_probs, old_log_probs, advantages, clip_range)
     gains, share = ratio * advantages, 1 / len(ratio)
     clipped_gains = np.minimum(np.maximum(ratio, 1 - clip_range), 1 + clip_range) * advantages
     outside = np.count_nonzero(np.abs(ratio - 1) > clip_range)
-    metrics = -share * np.minimum(gains, clipped_gains).sum(), share * (ratio - 1 - log_ratio).sum(), share * outside
+    metrics = (
+        -share * np.minimum(gains, clipped_gains).sum(),
+        share * (ratio - 1 - log_ratio).sum(),
+        share * outside,
+    )
     return metrics, np.where(gains <= clipped_gains, gains, 0) * -share
 
 
@@ -397,7 +498,10 @@ def categorical_head(policy, logits, actions):
     entropies = -(probs * log_all).sum(1)
 
     def pull_back(d_log_probs, d_entropy):
-        gradient = -(d_log_probs[:, None] + (d_entropy / len(rows)) * (log_all + entropies[:, None])) * probs
+        gradient = (
+            -(d_log_probs[:, None] + (d_entropy / len(rows)) * (log_all + entropies[:, None]))
+            * probs
+        )
         gradient[rows, actions] += d_log_probs
         return gradient
 

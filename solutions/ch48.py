@@ -1,4 +1,6 @@
-"""Reference solutions of chapter 48: soft actor-critic's losses and targets, and the statistics of a fair comparison."""
+"""Reference solutions of chapter 48: soft actor-critic's losses and targets, and the
+statistics of a fair comparison.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ def squashed_gaussian_log_prob(mean, log_std, pre_tanh_actions):
     scaled = (pre_tanh_actions - mean) * (-log_std).exp()
     normal = -0.5 * scaled.square() - log_std - 0.5 * math.log(2 * math.pi)
     # 1 - tanh² u = 4 / (e^u + e^-u)², and log(e^u + e^-u) = u + log(1 + e^-2u)
-    log_slope = 2 * (math.log(2) - pre_tanh_actions - functional.softplus(-2 * pre_tanh_actions))
+    log_slope = 2 * (
+        math.log(2) - pre_tanh_actions - functional.softplus(-2 * pre_tanh_actions)
+    )
     return (normal - log_slope).sum(-1)
 
 
@@ -59,7 +63,13 @@ def soft_q_target(rewards, terminated, next_q1, next_q2, next_log_probs, alpha, 
     Returns: (B,), without a graph.
     Raises: ValueError if the shapes differ or gamma is outside [0, 1].
     """
-    validate.same_shape(rewards=rewards, terminated=terminated, next_q1=next_q1, next_q2=next_q2, next_log_probs=next_log_probs)
+    validate.same_shape(
+        rewards=rewards,
+        terminated=terminated,
+        next_q1=next_q1,
+        next_q2=next_q2,
+        next_log_probs=next_log_probs,
+    )
     validate.unit_interval(gamma=gamma)
     with torch.no_grad():
         soft_values = torch.minimum(next_q1, next_q2) - alpha * next_log_probs
@@ -89,7 +99,8 @@ def sac_actor_loss(q1, q2, log_probs, alpha):
 
 
 def temperature_loss(log_alpha, log_probs, target_entropy):
-    """The temperature's loss: descending it raises alpha while the entropy is below the target.
+    """The temperature's loss: descending it raises alpha while the entropy is below the
+    target.
 
         L = -mean(exp(log α) (log π(a|s) + H̄))
 
@@ -129,7 +140,8 @@ def polyak_update(target_params, online_params, tau):
 
 
 def interquartile_mean(scores):
-    """The mean of the middle half of all scores: no lucky run lifts it, no failed one ruins it.
+    """The mean of the middle half of all scores: no lucky run lifts it, no failed one ruins
+    it.
 
     A quarter of the weight is cut off at each end. Where the count n is no multiple of 4,
     the scores at the two edges count in part: the weights, n / 2 in all, are those of n
@@ -144,7 +156,9 @@ def interquartile_mean(scores):
     """
     ordered = scores.flatten().sort().values
     count = len(ordered)
-    edges = torch.arange(count + 1, dtype=scores.dtype, device=scores.device).clamp(count / 4, 3 * count / 4)
+    edges = torch.arange(count + 1, dtype=scores.dtype, device=scores.device).clamp(
+        count / 4, 3 * count / 4
+    )
     return edges.diff() @ ordered / (count / 2)
 
 
@@ -196,9 +210,14 @@ def repaired_transitions(obs, sent, rewards, next_obs, terminated, truncated, lo
         "truncated": truncated,
     }.items():
         if len(rows) != len(obs):
-            raise ValueError(f"{name} must have as many rows as obs, {len(obs)}, got {len(rows)}")
+            raise ValueError(
+                f"{name} must have as many rows as obs, {len(obs)}, got {len(rows)}"
+            )
     if not (low < high).all():
-        raise ValueError(f"low must lie below high in every component, got {low.tolist()} and {high.tolist()}")
+        raise ValueError(
+            f"low must lie below high in every component, got {low.tolist()} and "
+            f"{high.tolist()}"
+        )
     middle, reach = (low + high) / 2, (high - low) / 2
     return Transitions(obs, (sent - middle) / reach, rewards, next_obs, terminated)
 
@@ -206,8 +225,8 @@ def repaired_transitions(obs, sent, rewards, next_obs, terminated, truncated, lo
 def fast_sac_update(agent, batch, settings, taught, generator):
     """What course_lib.sac.update does, up to rounding, in three quarters of its time.
 
-    Much of a plain update is not arithmetic on matrices but PyTorch's bookkeeping. So the losses
-    are differentiated on paper. With u = μ + σ ε, a = tanh u, B samples:
+    Much of a plain update is not arithmetic on matrices but PyTorch's bookkeeping. So the
+    losses are differentiated on paper. With u = μ + σ ε, a = tanh u, B samples:
 
         ∂L/∂Q = 2 (Q - y) / B for each critic,
         ∂L/∂u = [2 α a - (1 - a²) ∂min(Q₁, Q₂)/∂a] / B,
@@ -220,20 +239,28 @@ def fast_sac_update(agent, batch, settings, taught, generator):
     obs, actions, rewards, next_obs, terminated = (column.numpy() for column in batch)
     count, size = len(rewards), actions.shape[1]
     alpha = math.exp(agent.log_alpha.item())
-    noise = torch.randn((2, count, size), generator=generator).numpy()  # for the next states first, as update draws it
+    # for the next states first, as update draws it
+    noise = torch.randn((2, count, size), generator=generator).numpy()
 
-    policy = agent.actor.forward(0, np.concatenate([next_obs, obs]))  # the actor changes last: one pass for both
-    std, pre_tanh, free = _sampled(policy[-1], noise.reshape(2 * count, size), agent.log_std_range)
+    # the actor changes last: one pass for both
+    policy = agent.actor.forward(0, np.concatenate([next_obs, obs]))
+    std, pre_tanh, free = _sampled(
+        policy[-1], noise.reshape(2 * count, size), agent.log_std_range
+    )
     squashed = np.tanh(pre_tanh)
     log_slope = 2 * (math.log(2) - pre_tanh - np.logaddexp(0, -2 * pre_tanh))
     constant = 0.5 * math.log(2 * math.pi)
-    log_probs = -(0.5 * noise.reshape(2 * count, size) ** 2 + np.log(std) + constant + log_slope).sum(1)
+    log_probs = -(
+        0.5 * noise.reshape(2 * count, size) ** 2 + np.log(std) + constant + log_slope
+    ).sum(1)
     next_squashed, squashed = squashed[:count], squashed[count:]
     next_log_probs, log_probs = log_probs[:count], log_probs[count:]
 
     following = np.concatenate([next_obs, next_squashed], 1)
     next_q = np.minimum(*(agent.targets.forward(i, following)[-1][:, 0] for i in range(2)))
-    targets = rewards + settings.gamma * np.where(terminated, 0, next_q - alpha * next_log_probs)
+    targets = rewards + settings.gamma * np.where(
+        terminated, 0, next_q - alpha * next_log_probs
+    )
     taken, critic_loss = np.concatenate([obs, actions], 1), 0.0
     for i in range(2):
         activations = agent.critics.forward(i, taken)
@@ -247,19 +274,28 @@ def fast_sac_update(agent, batch, settings, taught, generator):
     first_is_less = judged[0][-1] <= judged[1][-1]
     chosen = (first_is_less, ~first_is_less)
     d_squashed = sum(
-        agent.critics.backward(i, judged[i], chosen[i] * np.float32(-1 / count), to_weights=False)[:, obs.shape[1] :]
+        agent.critics.backward(
+            i, judged[i], chosen[i] * np.float32(-1 / count), to_weights=False
+        )[:, obs.shape[1] :]
         for i in range(2)
     )
     d_pre_tanh = (2 * alpha / count) * squashed + (1 - squashed**2) * d_squashed
     d_log_std = (std[count:] * noise[1] * d_pre_tanh - alpha / count) * free[count:]
     activations = [layer[count:] for layer in policy]
-    agent.actor.backward(0, activations, np.concatenate([d_pre_tanh, d_log_std], 1), to_inputs=False)
+    agent.actor.backward(
+        0, activations, np.concatenate([d_pre_tanh, d_log_std], 1), to_inputs=False
+    )
     agent.actor_optimizer.step(torch.from_numpy(agent.actor.gradient))
     surplus = log_probs.mean() + agent.target_entropy
     agent.temperature_optimizer.step(torch.as_tensor(-alpha * surplus))
 
     polyak_update([agent.targets.weights], [agent.critics.weights], settings.tau)
-    metrics = {"critic_loss": critic_loss, "q": judged[0][-1].mean(), "entropy": -log_probs.mean(), "alpha": alpha}
+    metrics = {
+        "critic_loss": critic_loss,
+        "q": judged[0][-1].mean(),
+        "entropy": -log_probs.mean(),
+        "alpha": alpha,
+    }
     return {name: torch.as_tensor(value) for name, value in metrics.items()}
 
 
@@ -267,4 +303,8 @@ def _sampled(outputs, noise, log_std_range):
     """Of an actor's outputs: σ, the pre-activations, and where log σ is inside its range."""
     mean, log_std = np.split(outputs, 2, axis=1)
     std = np.exp(np.clip(log_std, *log_std_range))
-    return std, mean + std * noise, (log_std >= log_std_range[0]) & (log_std <= log_std_range[1])
+    return (
+        std,
+        mean + std * noise,
+        (log_std >= log_std_range[0]) & (log_std <= log_std_range[1]),
+    )

@@ -1,4 +1,6 @@
-"""Reference solutions of chapter 51: learning a model of the world, imagining with it, and measuring where it fails."""
+"""Reference solutions of chapter 51: learning a model of the world, imagining with it, and
+measuring where it fails.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,8 @@ from course_lib import validate
 
 
 def gaussian_nll(mean, log_var, targets):
-    """Negative log-likelihood of an ensemble of models that each predict a normal distribution.
+    """Negative log-likelihood of an ensemble of models that each predict a normal
+    distribution.
 
         L = mean(½ [log σ² + (y - μ)² / σ² + log 2π]),   σ² = exp(log_var)
 
@@ -30,8 +33,16 @@ def gaussian_nll(mean, log_var, targets):
     """
     validate.same_shape(mean=mean, log_var=log_var)
     targets = targets.detach()
-    validate.same_shape(mean=mean, targets=targets.expand_as(mean) if targets.shape == mean.shape[1:] else targets)
-    return 0.5 * (log_var + (targets - mean).square() * (-log_var).exp() + math.log(2 * math.pi)).mean()
+    validate.same_shape(
+        mean=mean,
+        targets=targets.expand_as(mean) if targets.shape == mean.shape[1:] else targets,
+    )
+    return (
+        0.5
+        * (
+            log_var + (targets - mean).square() * (-log_var).exp() + math.log(2 * math.pi)
+        ).mean()
+    )
 
 
 def imagine(model, policy, start_obs, horizon, generator):
@@ -54,13 +65,23 @@ def imagine(model, policy, start_obs, horizon, generator):
     Returns: dict of obs (H + 1, B, O), which begins with start_obs; actions (H, B, A),
       rewards (H, B), and continues (H, B).
     """
-    dream: dict[str, list] = {"obs": [start_obs], "actions": [], "rewards": [], "continues": []}
+    dream: dict[str, list] = {
+        "obs": [start_obs],
+        "actions": [],
+        "rewards": [],
+        "continues": [],
+    }
     alive = torch.ones_like(start_obs[:, 0])
     for _ in range(horizon):
         actions = policy(dream["obs"][-1], generator)
         next_obs, rewards, goes_on = model(dream["obs"][-1], actions, generator)
         alive = alive * goes_on
-        for name, entry in {"obs": next_obs, "actions": actions, "rewards": rewards, "continues": alive}.items():
+        for name, entry in {
+            "obs": next_obs,
+            "actions": actions,
+            "rewards": rewards,
+            "continues": alive,
+        }.items():
             dream[name].append(entry)
     return {name: torch.stack(column) for name, column in dream.items()}
 
@@ -87,7 +108,9 @@ def dreamer_lambda_returns(rewards, values, continues, gamma, lam):
     validate.same_shape(rewards=rewards, values=values, continues=continues)
     validate.unit_interval(gamma=gamma, lam=lam)
     returns, following = [], values[-1]
-    for reward, value, goes_on in zip(rewards.flip(0), values.flip(0), continues.flip(0), strict=True):
+    for reward, value, goes_on in zip(
+        rewards.flip(0), values.flip(0), continues.flip(0), strict=True
+    ):
         following = reward + gamma * goes_on * ((1 - lam) * value + lam * following)
         returns.append(following)
     return torch.stack(returns).flip(0)
@@ -112,7 +135,8 @@ def model_error_by_horizon(model, obs, actions, generator):
     """
     if len(obs) != len(actions) + 1 or obs.shape[1] != actions.shape[1]:
         raise ValueError(
-            f"obs must have one step more than actions and the same batch, got obs {tuple(obs.shape)}, actions {tuple(actions.shape)}"
+            "obs must have one step more than actions and the same batch, got obs "
+            f"{tuple(obs.shape)}, actions {tuple(actions.shape)}"
         )
     predicted, errors = obs[0], []
     with torch.no_grad():
@@ -141,7 +165,9 @@ def repaired_next_obs(network, obs, actions, seen):
     Raises: ValueError if obs and actions have different batches.
     """
     if len(obs) != len(actions):
-        raise ValueError(f"obs and actions must have the same batch, got {len(obs)} and {len(actions)} rows")
+        raise ValueError(
+            f"obs and actions must have the same batch, got {len(obs)} and {len(actions)} rows"
+        )
     learned_from = torch.cat([seen["obs"], seen["actions"]], -1)
     changes = seen["next_obs"] - seen["obs"]
     inputs = (torch.cat([obs, actions], -1) - learned_from.mean(0)) / learned_from.std(0)

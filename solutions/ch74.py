@@ -1,4 +1,6 @@
-"""Reference solutions of chapter 74: behavioural cloning, from the expert's demonstrations to the measured clone."""
+"""Reference solutions of chapter 74: behavioural cloning, from the expert's demonstrations
+to the measured clone.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,8 @@ def collect_demonstrations(policy, env, num_episodes, seed):
         obs, _ = env.reset(seed=seed + episode)
         total, ended = 0.0, False
         while not ended:
-            seen = torch.tensor(obs, dtype=torch.float32)  # torch.tensor copies: the environment may reuse its array
+            # torch.tensor copies: the environment may reuse its array
+            seen = torch.tensor(obs, dtype=torch.float32)
             with torch.no_grad():
                 action = policy(seen.unsqueeze(0)).squeeze(0)
             obs, reward, terminated, truncated, _ = env.step(action.numpy())
@@ -42,7 +45,12 @@ def collect_demonstrations(policy, env, num_episodes, seed):
             total += float(reward)
             ended = terminated or truncated
         returns.append(total)
-    return Demonstrations(torch.stack(obs_rows), torch.stack(action_rows), torch.tensor(episode_ids), torch.tensor(returns))
+    return Demonstrations(
+        torch.stack(obs_rows),
+        torch.stack(action_rows),
+        torch.tensor(episode_ids),
+        torch.tensor(returns),
+    )
 
 
 def split_by_episode(episode_ids, fraction, generator):
@@ -62,7 +70,10 @@ def split_by_episode(episode_ids, fraction, generator):
     validate.unit_interval(fraction=fraction)
     episodes = episode_ids.unique()
     if len(episodes) < 2:
-        raise ValueError(f"episode_ids must name at least two episodes, one for either side, got {len(episodes)}")
+        raise ValueError(
+            "episode_ids must name at least two episodes, one for either side, got "
+            f"{len(episodes)}"
+        )
     count = min(max(round(fraction * len(episodes)), 1), len(episodes) - 1)
     order = torch.randperm(len(episodes), generator=generator)
     held_out = torch.isin(episode_ids, episodes[order[:count]])
@@ -86,7 +97,8 @@ def behavioural_cloning_loss(logits, expert_actions):
     """
     if logits.ndim != 2 or expert_actions.shape != logits.shape[:1]:
         raise ValueError(
-            f"logits must be (B, A) and expert_actions (B,), got {tuple(logits.shape)} and {tuple(expert_actions.shape)}"
+            "logits must be (B, A) and expert_actions (B,), got "
+            f"{tuple(logits.shape)} and {tuple(expert_actions.shape)}"
         )
     return torch.nn.functional.cross_entropy(logits, expert_actions)
 
@@ -110,14 +122,28 @@ def gaussian_cloning_loss(mean, log_std, expert_actions):
     """
     validate.same_shape(mean=mean, expert_actions=expert_actions)
     if log_std.shape not in (mean.shape, mean.shape[-1:]):
-        raise ValueError(f"log_std must be (A,) or (B, A) for mean {tuple(mean.shape)}, got {tuple(log_std.shape)}")
-    surprise = ((expert_actions.detach() - mean) / log_std.exp()).square() / 2 + log_std + math.log(2 * math.pi) / 2
+        raise ValueError(
+            f"log_std must be (A,) or (B, A) for mean {tuple(mean.shape)}, got "
+            f"{tuple(log_std.shape)}"
+        )
+    surprise = (
+        ((expert_actions.detach() - mean) / log_std.exp()).square() / 2
+        + log_std
+        + math.log(2 * math.pi) / 2
+    )
     return surprise.sum(-1).mean()
 
 
 def train_bc(
-    network, loss_fn, obs, actions, num_steps=1000, batch_size=128, learning_rate=3e-3, generator=None
-):  # fmt: skip
+    network,
+    loss_fn,
+    obs,
+    actions,
+    num_steps=1000,
+    batch_size=128,
+    learning_rate=3e-3,
+    generator=None,
+):
     """Behavioural cloning: fit a network to the expert's actions, by gradient descent.
 
     Pomerleau (1991), https://doi.org/10.1162/neco.1991.3.1.88
@@ -182,16 +208,25 @@ def state_shift(expert_obs, agent_obs):
     Returns: scalar (0-dim) tensor, at least 0 (up to rounding); 0 for equal samples.
     Raises: ValueError if the two are not matrices of one width.
     """
-    if expert_obs.ndim != 2 or agent_obs.ndim != 2 or expert_obs.shape[1] != agent_obs.shape[1]:
+    if (
+        expert_obs.ndim != 2
+        or agent_obs.ndim != 2
+        or expert_obs.shape[1] != agent_obs.shape[1]
+    ):
         raise ValueError(
-            f"expert_obs must be (N, O) and agent_obs (M, O), got {tuple(expert_obs.shape)} and {tuple(agent_obs.shape)}"
+            "expert_obs must be (N, O) and agent_obs (M, O), got "
+            f"{tuple(expert_obs.shape)} and {tuple(agent_obs.shape)}"
         )
     scale = expert_obs.std(0)
     x, y = expert_obs / scale, agent_obs / scale
 
     def mean_distance(a, b):
-        # a thousand rows at a time, and no matrix product, which would lose the digits of small distances
-        rows = [torch.cdist(block, b, compute_mode="donot_use_mm_for_euclid_dist").mean(1) for block in a.split(1000)]
+        # a thousand rows at a time, and no matrix product, which would lose the digits of
+        # small distances
+        rows = [
+            torch.cdist(block, b, compute_mode="donot_use_mm_for_euclid_dist").mean(1)
+            for block in a.split(1000)
+        ]
         return torch.cat(rows).mean()
 
     return 2 * mean_distance(x, y) - mean_distance(x, x) - mean_distance(y, y)

@@ -1,4 +1,6 @@
-"""Reference solutions of chapter 80: a reward learned from comparisons of trajectory segments."""
+"""Reference solutions of chapter 80: a reward learned from comparisons of trajectory
+segments.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ def segment_returns(rewards, mask):
 
 
 def preference_probability(returns_a, returns_b):
-    """How likely a person is to prefer segment a to segment b, by the model of Bradley and Terry.
+    """How likely a person is to prefer segment a to segment b, by the model of Bradley and
+    Terry.
 
         P(a ≻ b) = exp(R_a) / (exp(R_a) + exp(R_b)) = 1 / (1 + exp(R_b - R_a))
 
@@ -63,7 +66,10 @@ def simulate_preferences(true_returns_a, true_returns_b, temperature, generator)
     validate.same_shape(true_returns_a=true_returns_a, true_returns_b=true_returns_b)
     validate.positive(temperature=temperature)
     probabilities = torch.sigmoid((true_returns_a - true_returns_b) / temperature)
-    return torch.rand(probabilities.shape, generator=generator, dtype=probabilities.dtype) < probabilities
+    return (
+        torch.rand(probabilities.shape, generator=generator, dtype=probabilities.dtype)
+        < probabilities
+    )
 
 
 def bradley_terry_loss(chosen_returns, rejected_returns):
@@ -135,5 +141,8 @@ def repaired_segment_returns(reward_model, obs, mask):
     Raises: ValueError if the leading shapes (B, T) of obs and mask differ.
     """
     if obs.shape[:-1] != mask.shape:
-        raise ValueError(f"obs and mask must agree in (B, T), got obs {tuple(obs.shape)}, mask {tuple(mask.shape)}")
+        raise ValueError(
+            f"obs and mask must agree in (B, T), got obs {tuple(obs.shape)}, mask "
+            f"{tuple(mask.shape)}"
+        )
     return segment_returns(reward_model(obs), mask)

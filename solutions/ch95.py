@@ -52,7 +52,8 @@ def completion_mask(input_ids, prompt_lengths, eos_token_id):
 
 
 def kl_penalized_rewards(scores, logps, ref_logps, mask, kl_coef):
-    """One reward for each token: a penalty for leaving the reference, and the score at the end.
+    """One reward for each token: a penalty for leaving the reference, and the score at the
+    end.
 
         r_t = -β (log π(t) - log π_ref(t)) + score · [t is the row's last kept token]
 
@@ -169,11 +170,14 @@ def ppo_token_loss(logps, old_logps, advantages, mask, clip_range=0.2):
     validate.non_negative(clip_range=clip_range)
     ratio = (logps - old_logps.detach())[mask].exp()
     weights = advantages.detach()[mask]
-    return -torch.minimum(ratio * weights, ratio.clamp(1 - clip_range, 1 + clip_range) * weights).mean()
+    return -torch.minimum(
+        ratio * weights, ratio.clamp(1 - clip_range, 1 + clip_range) * weights
+    ).mean()
 
 
 def repaired_reward_scaling(rewards, mask, eps=1e-8):
-    """What the suspect program of the bug lab should have handed to masked_gae in place of raw rewards.
+    """What the suspect program of the bug lab should have handed to masked_gae in place of raw
+    rewards.
 
     Rewards on a scale of their own, whatever the unit of the score: the kept entries of
     the batch have unit standard deviation (around their mean), and every text is as much

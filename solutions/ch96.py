@@ -1,4 +1,6 @@
-"""Reference solutions of chapter 96: reward models from comparisons, and best-of-n beside them."""
+"""Reference solutions of chapter 96: reward models from comparisons, and best-of-n beside
+them.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ from course_lib import validate
 
 
 def last_token_scores(values, attention_mask):
-    """The reward model's verdict on each text: its number at the last token that is no padding.
+    """The reward model's verdict on each text: its number at the last token that is no
+    padding.
 
     Only there has a causal model read the whole text.
 
@@ -119,7 +122,9 @@ def repaired_choices(first, second, first_ratings, second_ratings):
       that are left out; two tensors of one length, int64.
     Raises: ValueError if the shapes differ.
     """
-    validate.same_shape(first=first, second=second, first_ratings=first_ratings, second_ratings=second_ratings)
+    validate.same_shape(
+        first=first, second=second, first_ratings=first_ratings, second_ratings=second_ratings
+    )
     decided = first_ratings != second_ratings
     first_wins = (first_ratings > second_ratings)[decided]
     first, second = first[decided], second[decided]

@@ -1,4 +1,6 @@
-"""Reference solutions of chapter 97: direct preference optimisation and what its derivation rests on."""
+"""Reference solutions of chapter 97: direct preference optimisation and what its
+derivation rests on.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ def sequence_logps(logits, input_ids, completion_mask):
     Returns: (B,) log-probabilities in nats.
     Raises: ValueError if batch or length differ.
     """
-    validate.same_shape(logits=logits[..., 0], input_ids=input_ids, completion_mask=completion_mask)
+    validate.same_shape(
+        logits=logits[..., 0], input_ids=input_ids, completion_mask=completion_mask
+    )
     logps = logits[:, :-1].log_softmax(-1).gather(-1, input_ids[:, 1:, None]).squeeze(-1)
     return torch.where(completion_mask[:, 1:], logps, 0).sum(1)
 
@@ -36,7 +40,8 @@ def dpo_loss(
     beta=0.1,
     label_smoothing=0.0,
 ):
-    """Direct preference optimisation: a reward model's loss in which the policy is the reward model.
+    """Direct preference optimisation: a reward model's loss in which the policy is the reward
+    model.
 
         loss = -(1 - s) log σ(x) - s log σ(-x),
         x = β [(chosen - ref_chosen) - (rejected - ref_rejected)]
@@ -75,7 +80,8 @@ def dpo_loss(
 
 
 def ipo_loss(chosen_logps, rejected_logps, ref_chosen_logps, ref_rejected_logps, beta=0.1):
-    """Identity preference optimisation: the margin is pulled to a finite target, not to infinity.
+    """Identity preference optimisation: the margin is pulled to a finite target, not to
+    infinity.
 
         loss = [(chosen - ref_chosen) - (rejected - ref_rejected) - 1 / (2 β)]²
 
@@ -98,7 +104,9 @@ def ipo_loss(chosen_logps, rejected_logps, ref_chosen_logps, ref_rejected_logps,
         ref_rejected_logps=ref_rejected_logps,
     )
     validate.positive(beta=beta)
-    margins = (chosen_logps - ref_chosen_logps.detach()) - (rejected_logps - ref_rejected_logps.detach())
+    margins = (chosen_logps - ref_chosen_logps.detach()) - (
+        rejected_logps - ref_rejected_logps.detach()
+    )
     return (margins - 1 / (2 * beta)) ** 2
 
 
