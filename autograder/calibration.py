@@ -22,8 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
-from autograder.spec import Artefact
-from course_lib import records
+from autograder.authoring.spec import Artefact
+from course_lib.figures import records
 
 BAR, BAR_WRONG = 0.01, 0.05
 DRAWS = 200_000

@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 if TYPE_CHECKING:
-    from autograder.assemble import Outputs
-    from autograder.chapter import Chapter
+    from autograder.authoring.assemble import Outputs
+    from autograder.authoring.chapter import Chapter
 
 # Each command imports what it needs: torch, nbgrader and Sphinx cost seconds, and `course --help` should not.
 
@@ -29,7 +29,7 @@ def _stop(message: object, status: int = BAD_INPUT) -> None:
 
 def _recorded(page: Chapter) -> Outputs | None:
     """A chapter's outputs in the book, if its notebook shows any; they come from the cache, or the chapter is run."""
-    from autograder import execution
+    from autograder.publishing import execution
 
     return execution.executed_outputs(page) if any("book-only" in cell.tags for cell in page.cells) else None
 
@@ -41,7 +41,7 @@ def book(
     ] = False,
 ) -> None:
     """Build the HTML book into book/_build/html."""
-    from autograder import book as builder
+    from autograder.publishing import book as builder
 
     try:
         print(f"The book is at {builder.build(with_solutions=not without_solutions) / 'index.html'}")
@@ -55,7 +55,7 @@ def release(
     only: Annotated[list[str] | None, typer.Option(help="Release this chapter only, as in --only ch44; may be repeated.")] = None,
 ) -> None:
     """Write the student bundle: notebooks, course_lib, and a zip of it all. Never overwrites a learner's work."""
-    from autograder import release as releaser
+    from autograder.publishing import release as releaser
 
     try:
         print(f"The bundle is at {releaser.release(out, only, recorded=_recorded)}")
@@ -66,8 +66,9 @@ def release(
 @app.command()
 def hub(folder: Annotated[Path, typer.Argument(help="A new or existing folder for nbgrader's course.")]) -> None:
     """Lay out a course for plain nbgrader: source notebooks with solutions and hidden tests, and its configuration. For teachers only."""
-    from autograder import checks, freeze, paths
-    from autograder import release as releaser
+    from autograder import checks, paths
+    from autograder.authoring import freeze
+    from autograder.publishing import release as releaser
 
     try:
         freeze.write(
@@ -81,11 +82,12 @@ def hub(folder: Annotated[Path, typer.Argument(help="A new or existing folder fo
 @app.command()
 def check(notebook: Annotated[Path, typer.Argument(help="A student notebook.")]) -> None:
     """Run the visible checks of one notebook, in this process: for your own code."""
-    from autograder import checks, freeze
-    from course_lib import checking, command
+    from autograder import checks
+    from autograder.authoring import freeze
+    from course_lib.checks import client, command
 
     text = notebook.read_bytes().decode(errors="replace") if notebook.is_file() else ""  # what is wrong with it, `main` says
-    freeze.write([exercise for exercise in checks.all_exercises() if f"check({exercise.name})" in text], checking.FROZEN)
+    freeze.write([exercise for exercise in checks.all_exercises() if f"check({exercise.name})" in text], client.FROZEN)
     raise typer.Exit(command.main([str(notebook)]))
 
 
@@ -108,7 +110,8 @@ def grade(
     """Grade all submissions in a folder. Exit status: 0 all have a verdict, 1 below --fail-under, 2 bad input, 3 the grader failed."""
     from sqlalchemy.exc import SQLAlchemyError
 
-    from autograder import grade, sandbox
+    from autograder import grade
+    from autograder.grading import sandbox
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     # away from a terminal it would leave an empty line
@@ -125,7 +128,8 @@ def grade(
         except (OSError, SQLAlchemyError) as error:  # a full disk, most likely; Python's own exit status would mean low scores
             bar.stop()
             _stop(f"the grades cannot be written: {error}. What is written is whole; mend this and grade again.", BROKEN)
-    from autograder import exports, verdicts
+    from autograder.grading import verdicts
+    from autograder.reporting import exports
 
     Console(highlight=False).print(exports.table(results))
     for line in exports.same_files(verdicts.read_all(out / "verdicts")):  # also of students who are absent this time

@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 from rich.console import Console
 from rich.table import Table
 
-from autograder import sandbox
+from autograder.grading import sandbox
 
 ROOT = Path(__file__).resolve().parents[1]
 PYTHONS = (3, 11), (3, 13)  # the oldest and the newest that the pins are tried with
@@ -123,7 +123,7 @@ def _sandbox() -> Check:
 def _flights() -> Check:
     """Whether a file that is handed in could be flown: one episode of a policy that does nothing."""
     try:
-        from course_lib import flight  # here, because Gymnasium takes a third of a second
+        from course_lib.control import flight  # here, because Gymnasium takes a third of a second
 
         task = flight.TASKS["lander"]
         idle = {name: np.full(shape, float(name == "obs_std"), np.float32) for name, shape in task.tensors.items()}

@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING
 
 from nbformat import NotebookNode
 
-from autograder import assemble, chapter, intake, judge, sandbox, verdicts
-from autograder.verdicts import Verdict
+from autograder.authoring import assemble, chapter
+from autograder.grading import intake, judge, sandbox, verdicts
+from autograder.grading.verdicts import Verdict
 
 if TYPE_CHECKING:
-    from autograder.gradebook import GradebookWriter
+    from autograder.reporting.gradebook import GradebookWriter
 
 Task = tuple[str, str, Path]
 Judged = tuple[Verdict, NotebookNode | None]
@@ -74,7 +75,10 @@ def _write_all(
     tasks: list[Task], judged: Iterator[Judged], out: Path, db_url: str | None, progress: Callable[[int, int, str], None]
 ) -> list[Verdict]:
     """Write everything down, as the verdicts come in."""
-    from autograder import exports, gradebook  # nbgrader takes seconds to import, in which the first submissions are judged
+    from autograder.reporting import (  # nbgrader takes seconds to import, in which the first submissions are judged
+        exports,
+        gradebook,
+    )
 
     releases = {page.assignment: assemble.student_view(page) for page in chapter.all_chapters()}
     gradebook.write_course(out, releases, db_url)
@@ -183,7 +187,7 @@ def _write(
     verdict: Verdict, notebook: NotebookNode | None, out: Path, book: GradebookWriter, releases: dict[str, NotebookNode]
 ) -> Verdict:
     """Gradebook first, then the notebook that formgrader shows, then the verdict, which says that the rest is done."""
-    from autograder import gradebook
+    from autograder.reporting import gradebook
 
     if verdict.assignment in releases:
         previous = gradebook.read_autograded(out, verdict.student, verdict.assignment)

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from autograder import freeze
-from autograder.spec import Exercise
-from course_lib.diagnosis import diagnose, examine
+from autograder.authoring import freeze
+from autograder.authoring.spec import Exercise
+from course_lib.checks.diagnosis import diagnose, examine
 
 SEEDS = 50
 

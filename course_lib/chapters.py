@@ -9,8 +9,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from course_lib.checking import check, is_judged_by_file
-from course_lib.notebook import code_cells, new_namespace, run_cells
+from course_lib.checks.client import check, is_judged_by_file
+from course_lib.checks.notebook import code_cells, new_namespace, run_cells
 
 REFERENCES = "COURSE_REFERENCES"
 """Environment variable with the package whose functions the book's own pages use: page chNN of it."""

@@ -2,7 +2,7 @@
 
 import sys
 
-from course_lib.command import main
+from course_lib.checks.command import main
 
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:]))

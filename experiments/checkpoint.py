@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from course_lib.records import whole
+from course_lib.figures.records import whole
 
 NAME = "checkpoint.pt"
 

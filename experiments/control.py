@@ -21,11 +21,11 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from course_lib import envs, sac
-from course_lib.policies import Adam, policy_for
-from course_lib.ppo import PPOSettings
-from course_lib.rollouts import EpisodeReturns
-from course_lib.sac import SACSettings
+from course_lib.control import envs, sac
+from course_lib.control.policies import Adam, policy_for
+from course_lib.control.ppo import PPOSettings
+from course_lib.control.rollouts import EpisodeReturns
+from course_lib.control.sac import SACSettings
 from experiments import checkpoint, snapshots
 from experiments.runner import Report, Result
 from solutions import ch45, ch48

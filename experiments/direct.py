@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from course_lib import lm, preferences
-from course_lib.direct import Pairs, completion_logps, encode_pairs, like_lengths, reference_logps, train_step
-from course_lib.fine_tuning import Writer, Writing, openings
-from course_lib.judges import gold_judge
-from course_lib.reward_models import RewardModel, fit
-from course_lib.rlhf import whole_texts
+from course_lib.language import lm, preferences
+from course_lib.language.direct import Pairs, completion_logps, encode_pairs, like_lengths, reference_logps, train_step
+from course_lib.language.fine_tuning import Writer, Writing, openings
+from course_lib.language.judges import gold_judge
+from course_lib.language.reward_models import RewardModel, fit
+from course_lib.language.rlhf import whole_texts
 from experiments import rlhf
 from experiments.runner import Report, Result
 from solutions.ch96 import last_token_scores, reward_model_loss

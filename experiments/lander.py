@@ -21,9 +21,10 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from course_lib import envs, videos
-from course_lib.policies import ActorCritic, load_policy, policy_for, save_policy
-from course_lib.ppo import LANDER_SETTINGS, PPOSettings
+from course_lib.control import envs
+from course_lib.control.policies import ActorCritic, load_policy, policy_for, save_policy
+from course_lib.control.ppo import LANDER_SETTINGS, PPOSettings
+from course_lib.figures import videos
 from experiments.runner import Report, Result
 from solutions import ch44, ch45
 

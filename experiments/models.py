@@ -20,8 +20,9 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
-from course_lib import mbpo, videos
-from course_lib.mbpo import MBPOSettings
+from course_lib.control import mbpo
+from course_lib.control.mbpo import MBPOSettings
+from course_lib.figures import videos
 from experiments.control import ENVIRONMENTS, EPISODES, SACRun, followed
 from experiments.runner import Report, Result
 from solutions import ch48, ch51

@@ -14,11 +14,11 @@ from typing import Any
 
 import torch
 
-from course_lib import lm, preferences
-from course_lib.fine_tuning import Taught, TokenPPO, Writer, openings, train
-from course_lib.judges import gold_judge
-from course_lib.reward_models import RewardModel, fit
-from course_lib.rlhf import Proxy, liked_texts, next_token_loss, supervised, whole_texts
+from course_lib.language import lm, preferences
+from course_lib.language.fine_tuning import Taught, TokenPPO, Writer, openings, train
+from course_lib.language.judges import gold_judge
+from course_lib.language.reward_models import RewardModel, fit
+from course_lib.language.rlhf import Proxy, liked_texts, next_token_loss, supervised, whole_texts
 from experiments.runner import Report, Result
 from solutions import ch45, ch95, ch96
 

@@ -39,7 +39,7 @@ from uuid import uuid4
 
 import psutil
 
-from course_lib import records
+from course_lib.figures import records
 
 FOLDER = Path(__file__).parent
 RUNS = FOLDER / "runs"

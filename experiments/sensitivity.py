@@ -17,9 +17,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from course_lib import envs, sac
-from course_lib.policies import policy_for
-from course_lib.ppo import PPOSettings
+from course_lib.control import envs, sac
+from course_lib.control.policies import policy_for
+from course_lib.control.ppo import PPOSettings
 from experiments.control import NUM_ENVS, PPO_SETTINGS, evaluate
 from experiments.runner import Report, Result
 from solutions import ch45, ch48

@@ -13,8 +13,8 @@ from typing import Any
 
 import torch
 
-from course_lib import fine_tuning, lm
-from course_lib.fine_tuning import Taught, TokenPPO, Writer, Writing, openings, train, vader_scores
+from course_lib.language import fine_tuning, lm
+from course_lib.language.fine_tuning import Taught, TokenPPO, Writer, Writing, openings, train, vader_scores
 from experiments.runner import Report, Result
 from solutions import ch45, ch95
 

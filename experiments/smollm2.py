@@ -16,9 +16,9 @@ from typing import Any
 
 import torch
 
-from course_lib import lm, preferences
-from course_lib.direct import Pairs, encode_pairs, like_lengths, reference_logps, train_step
-from course_lib.fine_tuning import Taught, TokenPPO, Writer, Writing, openings, train, vader_scores
+from course_lib.language import lm, preferences
+from course_lib.language.direct import Pairs, encode_pairs, like_lengths, reference_logps, train_step
+from course_lib.language.fine_tuning import Taught, TokenPPO, Writer, Writing, openings, train, vader_scores
 from course_lib.seeding import seed_everything
 from experiments.runner import Report, Result
 from solutions import ch45, ch95

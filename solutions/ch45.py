@@ -11,9 +11,9 @@ import numpy as np
 import torch
 
 from course_lib import validate
-from course_lib.policies import Adam, Categorical, policy_for
-from course_lib.ppo import Batch
-from course_lib.rollouts import (
+from course_lib.control.policies import Adam, Categorical, policy_for
+from course_lib.control.ppo import Batch
+from course_lib.control.rollouts import (
     EpisodeReturns,
     Rollout,
     require_same_step_autoreset,

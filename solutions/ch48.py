@@ -11,7 +11,7 @@ import torch
 from torch.nn import functional
 
 from course_lib import validate
-from course_lib.replay import Transitions
+from course_lib.control.replay import Transitions
 
 
 def squashed_gaussian_log_prob(mean, log_std, pre_tanh_actions):
@@ -223,7 +223,7 @@ def repaired_transitions(obs, sent, rewards, next_obs, terminated, truncated, lo
 
 
 def fast_sac_update(agent, batch, settings, taught, generator):
-    """What course_lib.sac.update does, up to rounding, in three quarters of its time.
+    """What course_lib.control.sac.update does, up to rounding, in three quarters of its time.
 
     Much of a plain update is not arithmetic on matrices but PyTorch's bookkeeping. So the
     losses are differentiated on paper. With u = μ + σ ε, a = tanh u, B samples:
@@ -234,7 +234,7 @@ def fast_sac_update(agent, batch, settings, taught, generator):
 
     Here the density of a needs no care at its edges: u is known.
 
-    Args, returns: as course_lib.sac.update; `taught` is not asked.
+    Args, returns: as course_lib.control.sac.update; `taught` is not asked.
     """
     obs, actions, rewards, next_obs, terminated = (column.numpy() for column in batch)
     count, size = len(rewards), actions.shape[1]

@@ -9,7 +9,7 @@ import math
 import torch
 
 from course_lib import validate
-from course_lib.demonstrations import Demonstrations
+from course_lib.control.demonstrations import Demonstrations
 
 
 def collect_demonstrations(policy, env, num_episodes, seed):

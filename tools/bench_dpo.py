@@ -6,7 +6,7 @@ First the two must agree: on fixed log-probabilities (TRL's own loss code is cal
 the tiny language model, gradients included. Then both train it in single precision with fused AdamW, on batches of 16 pairs of 48
 tokens, of which each pair shares 16: with the reference asked in every step, and with its answers known beforehand. TRL is spared what
 it would do by default and ours doesn't: activation checkpoints, half precision, logs. It trains the network as transformers loads it
-("TRL") and as course_lib.lm does, with GELU in one kernel ("TRL, our GELU"). Seconds are processor time: the wall clock of a busy
+("TRL") and as course_lib.language.lm does, with GELU in one kernel ("TRL, our GELU"). Seconds are processor time: the wall clock of a busy
 machine says more about its other users. Ratios are taken within a round, between neighbours in time; the table shows medians.
 """
 
@@ -32,8 +32,8 @@ from rich.console import Console
 from rich.table import Table
 from trl import DPOConfig, DPOTrainer
 
-from course_lib import lm
-from course_lib.direct import Pairs, completion_logps, reference_logps, train_step
+from course_lib.language import lm
+from course_lib.language.direct import Pairs, completion_logps, reference_logps, train_step
 from solutions.ch97 import dpo_loss, ipo_loss, sequence_logps
 
 PAIRS, LENGTH, PROMPT = 16, 48, 16

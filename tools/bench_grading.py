@@ -19,8 +19,10 @@ from pathlib import Path
 
 import nbformat
 
-from autograder import assemble, chapter, checks, release
+from autograder import checks
+from autograder.authoring import assemble, chapter
 from autograder.paths import ROOT
+from autograder.publishing import release
 
 
 def solved(released: nbformat.NotebookNode, number: int) -> nbformat.NotebookNode:

@@ -25,8 +25,8 @@ from rich.table import Table
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 
-from course_lib.envs import make
-from course_lib.ppo import ZOO_SETTINGS
+from course_lib.control.envs import make
+from course_lib.control.ppo import ZOO_SETTINGS
 from solutions import ch45
 
 ENVIRONMENT, NUM_ENVS, ROLLOUTS = "LunarLanderContinuous-v3", 16, 2

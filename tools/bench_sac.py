@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.table import Table
 from stable_baselines3 import SAC
 
-from course_lib import sac
+from course_lib.control import sac
 from solutions import ch48
 
 ENVIRONMENT, WARM_UP = "Hopper-v5", 1_000

@@ -6,7 +6,7 @@
 The distribution carries the data of Hutto and Gilbert (2014): snippets of four kinds, each rated by some 20 people from -4 to 4. Every
 snippet and every rating is kept; of the texts, only HTML entities, quotation marks and runs of spaces are tidied. A snippet's split
 follows from its own text, so no draw is involved and repeated texts share a split. The same archive and the same pyarrow give the
-same file, byte for byte; its SHA-256, printed at the end, is the one in course_lib/preferences.py.
+same file, byte for byte; its SHA-256, printed at the end, is the one in course_lib/language/preferences.py.
 """
 
 from __future__ import annotations

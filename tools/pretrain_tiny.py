@@ -25,7 +25,7 @@ from tqdm import tqdm
 from transformers import GPT2Config, GPT2LMHeadModel
 
 from autograder.paths import COURSE_LIB
-from course_lib import lm, preferences
+from course_lib.language import lm, preferences
 from course_lib.seeding import seed_everything
 
 TARGET = COURSE_LIB / "models" / "tiny"

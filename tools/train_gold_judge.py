@@ -13,8 +13,8 @@ import argparse
 import safetensors.torch
 import torch
 
-from course_lib import preferences
-from course_lib.judges import BUCKETS, WEIGHTS, LinearJudge, features, gold_judge
+from course_lib.language import preferences
+from course_lib.language.judges import BUCKETS, WEIGHTS, LinearJudge, features, gold_judge
 
 SOURCES = ("film", "amazon", "tweet")  # editorials say nothing about how praise sounds
 RIDGE = 1.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 
-from autograder.spec import Artefact, Exercise
+from autograder.authoring.spec import Artefact, Exercise
 
 
 def exercises(assignment: str) -> tuple[Exercise | Artefact, ...]:

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import torch
 
-from autograder.mistakes import SHAPES
-from autograder.spec import Case, Exercise, Misconception
+from autograder.authoring.parts import SHAPES
+from autograder.authoring.spec import Case, Exercise, Misconception
 from course_lib import validate
 from solutions import ch43
 

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch.distributions import Independent, Normal
 
-from autograder.spec import Artefact, Case, Exercise, Misconception
-from course_lib import envs as environments
-from course_lib.cases import built
-from course_lib.policies import make_policy
-from course_lib.rollouts import Rollout, true_next_obs
+from autograder.authoring.spec import Artefact, Case, Exercise, Misconception
+from course_lib.checks.cases import built
+from course_lib.control import envs as environments
+from course_lib.control.policies import make_policy
+from course_lib.control.rollouts import Rollout, true_next_obs
 from solutions import ch43, ch45
 
 INF = math.inf
@@ -1046,7 +1046,7 @@ def _vector_env(maker, seed, steps=0, action=0.0, **options):
     """A running vector environment, as an argument, and what it shows."""
     env = built(f"envs.{maker}", **options)
     running = environments.begun(getattr(environments, maker)(**options), seed, steps, action)
-    return built("envs.begun", envs=env, seed=seed, steps=steps, action=action), np.array(running.observe())
+    return built("control.envs.begun", envs=env, seed=seed, steps=steps, action=action), np.array(running.observe())
 
 
 def _collecting(maker, num_steps, log_std=0.5, steps=0, action=0.0, **options):
@@ -1058,7 +1058,7 @@ def _collecting(maker, num_steps, log_std=0.5, steps=0, action=0.0, **options):
         shape = {"obs_dim": obs.shape[1], "action_dim": 1, "hidden": 4}
         return {
             "envs": envs,
-            "policy": built("policies.make_policy", log_std=log_std, seed=seeds[1], **shape),
+            "policy": built("control.policies.make_policy", log_std=log_std, seed=seeds[1], **shape),
             "num_steps": num_steps,
             "obs": obs,
             "generator": built("seeding.generator", seed=seeds[2]),
@@ -1151,7 +1151,7 @@ _COLLECT_MISTAKES = (
         "next-obs-after-reset",
         _rollout(successors=lambda obs, info, before: obs),
         "Where an episode ends, next_obs shows the first observation of the next one: the true last observation is in "
-        'info["final_obs"], and course_lib.rollouts.true_next_obs puts it in its place.',
+        'info["final_obs"], and course_lib.control.rollouts.true_next_obs puts it in its place.',
     ),
     Misconception(
         "next-obs-is-obs",
@@ -1319,10 +1319,10 @@ def _updated(size=16, minibatch_size=64, learning_rate=0.01, **settings):
         }
         chosen = {"num_epochs": 2, "minibatch_size": minibatch_size, "max_grad_norm": 0.5} | settings
         return {
-            "policy": built("policies.make_policy", obs_dim=3, action_dim=2, hidden=4, log_std=-0.5, seed=seeds[0]),
-            "optimizer": built("policies.Adam", learning_rate=learning_rate),
-            "batch": built("ppo.Batch", **batch),
-            "settings": built("ppo.PPOSettings", **chosen),
+            "policy": built("control.policies.make_policy", obs_dim=3, action_dim=2, hidden=4, log_std=-0.5, seed=seeds[0]),
+            "optimizer": built("control.policies.Adam", learning_rate=learning_rate),
+            "batch": built("control.ppo.Batch", **batch),
+            "settings": built("control.ppo.PPOSettings", **chosen),
             "generator": built("seeding.generator", seed=seeds[1]),
         }
 

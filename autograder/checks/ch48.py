@@ -10,7 +10,7 @@ import torch
 from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
 from torch.nn import functional
 
-from autograder.mistakes import (
+from autograder.authoring.parts import (
     CUT,
     SHAPES,
     after,
@@ -26,9 +26,9 @@ from autograder.mistakes import (
     uniform,
     without,
 )
-from autograder.spec import Case, Exercise, Misconception
-from course_lib.cases import built
-from course_lib.replay import Transitions
+from autograder.authoring.spec import Case, Exercise, Misconception
+from course_lib.checks.cases import built
+from course_lib.control.replay import Transitions
 from solutions import ch48
 
 HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
@@ -688,8 +688,11 @@ def _networks(tau=0.1, shapes=((3, 4), (4,), ()), parameters=(), once=()):
 
     def inputs(generator):
         drawn = {name: [normal(generator, *shape) for shape in shapes] for name in _PAIR}
-        made = {name: built("networks.parameters", tensors=drawn[name]) if name in parameters else drawn[name] for name in _PAIR}
-        made |= {name: built("networks.one_pass", tensors=drawn[name]) for name in once}
+        made = {
+            name: built("control.networks.parameters", tensors=drawn[name]) if name in parameters else drawn[name]
+            for name in _PAIR
+        }
+        made |= {name: built("control.networks.one_pass", tensors=drawn[name]) for name in once}
         return made | {"tau": tau}
 
     return inputs

@@ -9,7 +9,7 @@ import torch
 from torch.distributions import Normal
 from torch.nn import functional
 
-from autograder.mistakes import (
+from autograder.authoring.parts import (
     CUT,
     IN_PLACE,
     SHAPES,
@@ -24,8 +24,8 @@ from autograder.mistakes import (
     shape_cases,
     uniform,
 )
-from autograder.spec import Case, Exercise, Misconception
-from course_lib.cases import built
+from autograder.authoring.spec import Case, Exercise, Misconception
+from course_lib.checks.cases import built
 from solutions import ch51
 
 LOG_TWO_PI = math.log(2 * math.pi)
@@ -241,14 +241,14 @@ def _world(generator, obs_dim, action_dim, noise, limit):
     """A linear model and a linear policy, as descriptions; noise in one of them is noise in both."""
     dynamics = torch.eye(obs_dim, dtype=torch.float64) + 0.3 * normal(generator, obs_dim, obs_dim)
     model = built(
-        "dynamics.LinearModel",
+        "control.dynamics.LinearModel",
         dynamics=dynamics,
         control=normal(generator, action_dim, obs_dim),
         noise=noise,
         limit=limit,
         drift=2.0,
     )
-    return model, built("dynamics.LinearPolicy", gains=0.4 * normal(generator, obs_dim, action_dim), noise=noise)
+    return model, built("control.dynamics.LinearPolicy", gains=0.4 * normal(generator, obs_dim, action_dim), noise=noise)
 
 
 def _dreams(batch=6, obs_dim=3, action_dim=2, horizon=5, noise=0.0, limit=math.inf):
@@ -271,7 +271,7 @@ def _ending(generator):
     drawn = _dreams(batch=4, obs_dim=2, action_dim=1, horizon=4)(generator)
     turn = torch.tensor([[0.0, 1.0], [-1.0, 0.0]], dtype=torch.float64)  # a quarter of a turn: the first component comes back
     drawn["model"] = built(
-        "dynamics.LinearModel", dynamics=turn, control=torch.zeros(1, 2, dtype=torch.float64), limit=1.0, drift=2.0
+        "control.dynamics.LinearModel", dynamics=turn, control=torch.zeros(1, 2, dtype=torch.float64), limit=1.0, drift=2.0
     )
     start = 0.2 + 0.3 * uniform(generator, 4, 2)
     start[1, 1], start[2, 0] = 3.0, 5.0  # what is second now is first after a step; what is first, after two
@@ -930,7 +930,7 @@ def _planned(batch=5, seen=40, obs_dim=3, action_dim=2, spread=1.0):
         obs, actions = level + scale * normal(generator, seen, obs_dim), 1 + 2 * normal(generator, seen, action_dim)
         changes = normal(generator, obs_dim) + (0.3 + uniform(generator, obs_dim)) * normal(generator, seen, obs_dim)
         return {
-            "network": built("dynamics.FixedNetwork", weights=0.7 * normal(generator, obs_dim + action_dim, obs_dim)),
+            "network": built("control.dynamics.FixedNetwork", weights=0.7 * normal(generator, obs_dim + action_dim, obs_dim)),
             "obs": level + scale * (normal(generator, obs_dim) + spread * normal(generator, batch, obs_dim)),
             "actions": normal(generator, batch, action_dim),
             "seen": {"obs": obs, "actions": actions, "next_obs": obs + changes},

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from autograder import spec
-from autograder.spec import Exercise, Misconception
+from autograder.authoring import spec
+from autograder.authoring.spec import Exercise, Misconception
 from course_lib import validate
-from course_lib.cases import built
-from course_lib.demonstrations import Demonstrations
+from course_lib.checks.cases import built
+from course_lib.control.demonstrations import Demonstrations
 from solutions import ch74
 
 Case = functools.partial(spec.Case)  # one hidden draw of each: episodes and training runs cost time
@@ -84,27 +84,29 @@ def _drive(env, policy, **settings):
 
 
 def _driver(**settings):
-    return lambda _generator: built("road.RoadDriver", **settings)
+    return lambda _generator: built("control.road.RoadDriver", **settings)
 
 
 def _strong(generator):
     """Commands far beyond ±1, that lead off the road at once."""
-    return built("road.LinearPolicy", weights=_normal(generator, 1, 5), bias=torch.full((1,), 3.0, dtype=torch.float64))
+    return built("control.road.LinearPolicy", weights=_normal(generator, 1, 5), bias=torch.full((1,), 3.0, dtype=torch.float64))
 
 
 def _weak(generator):
     """Hardly any command: the rover leaves the road where it bends, sooner or later."""
-    return built("road.LinearPolicy", weights=0.05 * _normal(generator, 1, 5), bias=0.6 + 0.1 * _normal(generator, 1).abs())
+    return built(
+        "control.road.LinearPolicy", weights=0.05 * _normal(generator, 1, 5), bias=0.6 + 0.1 * _normal(generator, 1).abs()
+    )
 
 
 def _three_commands(generator):
-    return built("road.LinearPolicy", weights=_normal(generator, 3, 5), bias=0.1 * _normal(generator, 3), discrete=True)
+    return built("control.road.LinearPolicy", weights=_normal(generator, 3, 5), bias=0.1 * _normal(generator, 3), discrete=True)
 
 
-_ROAD = built("road.RoadEnv", time_limit=4, gust=0.05, start=0.7)
-_ONE_ARRAY = built("road.RoadEnv", time_limit=4, gust=0.05, start=0.7, one_array=True)
-_OPEN_ROAD = built("road.RoadEnv", time_limit=None, gust=0.05, start=0.7)
-_DISCRETE_ROAD = built("road.RoadEnv", time_limit=4, gust=0.05, discrete=True)
+_ROAD = built("control.road.RoadEnv", time_limit=4, gust=0.05, start=0.7)
+_ONE_ARRAY = built("control.road.RoadEnv", time_limit=4, gust=0.05, start=0.7, one_array=True)
+_OPEN_ROAD = built("control.road.RoadEnv", time_limit=None, gust=0.05, start=0.7)
+_DISCRETE_ROAD = built("control.road.RoadEnv", time_limit=4, gust=0.05, discrete=True)
 
 
 def _roll(
@@ -254,7 +256,7 @@ COLLECT_DEMONSTRATIONS = Exercise(
         Case("commands beyond ±1", _drive(_ROAD, _strong), visible=True),
         Case("discrete commands", _drive(_DISCRETE_ROAD, _three_commands)),
         Case("a single episode", _drive(_ROAD, _driver(), num_episodes=1)),
-        Case("one step an episode", _drive(built("road.RoadEnv", time_limit=1), _driver(), num_episodes=4)),
+        Case("one step an episode", _drive(built("control.road.RoadEnv", time_limit=1), _driver(), num_episodes=4)),
         Case("a road that fills one array anew", _drive(_ONE_ARRAY, _driver()), visible=True),
         Case("num_episodes = 0", _drive(_ROAD, _driver(), num_episodes=0), raises=["num_episodes"], visible=True),
     ),
@@ -966,8 +968,8 @@ def _regression(gain=1.0, rows=48, batch_size=48, num_steps=17, noise=0.3):
         signs = torch.randint(2, (1, 2), generator=generator) * 2 - 1
         errors = noise * _normal(generator, rows, 1)
         return {
-            "network": built("road.LinearPolicy", weights=torch.zeros(1, 2), bias=torch.zeros(1)),
-            "loss_fn": built("demonstrations.SquaredError", gain=gain),
+            "network": built("control.road.LinearPolicy", weights=torch.zeros(1, 2), bias=torch.zeros(1)),
+            "loss_fn": built("control.demonstrations.SquaredError", gain=gain),
             "obs": obs,
             "actions": obs @ (1.5 * signs.double()).T + 0.8 + errors,
             "num_steps": num_steps,
@@ -988,7 +990,7 @@ def _lines(generator):
 def _counted(generator):
     """Batches that one pass over the data fills, with a loss that is their size."""
     drawn = _regression(batch_size=8, num_steps=3)(generator)
-    return drawn | {"loss_fn": built("demonstrations.RowCount")}
+    return drawn | {"loss_fn": built("control.demonstrations.RowCount")}
 
 
 def _descend(network, learning_rate):

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from autograder.spec import Case, Exercise, Misconception
+from autograder.authoring.spec import Case, Exercise, Misconception
 from course_lib import validate
-from course_lib.cases import built
+from course_lib.checks.cases import built
 from solutions import ch80
 
 # ------------------------------------------------------------------------------------------------------- inputs
@@ -1080,7 +1080,7 @@ def _clips(batch=6, steps=9, full=False, zeros=False, front=False):
         mask = drawn["mask"].flip(1) if front else drawn["mask"]
         obs = _normal(generator, batch, steps, 3)
         model = built(
-            "clips.QuadraticReward",
+            "control.clips.QuadraticReward",
             linear=_normal(generator, 3),
             quadratic=_normal(generator, 3),
             bias=1 + torch.rand(1, generator=generator, dtype=torch.float64),

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from autograder.mistakes import (
+from autograder.authoring.parts import (
     IN_PLACE,
     SHAPES,
     after,
@@ -23,7 +23,7 @@ from autograder.mistakes import (
     reshaped,
     shape_cases,
 )
-from autograder.spec import Case, Exercise, Misconception
+from autograder.authoring.spec import Case, Exercise, Misconception
 from solutions import ch95
 
 INF = math.inf

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from autograder.mistakes import (
+from autograder.authoring.parts import (
     SHAPES,
     after,
     cut_from_graph,
@@ -21,7 +21,7 @@ from autograder.mistakes import (
     reshaped,
     shape_cases,
 )
-from autograder.spec import Case, Exercise, Misconception
+from autograder.authoring.spec import Case, Exercise, Misconception
 from course_lib import validate
 from solutions import ch97
 

@@ -8,7 +8,7 @@ paper.addEventListener("change", () => {
 });
 
 // Makes a form of each quiz. The page holds the question, the answers as one list and the explanations as a second, folded one
-// (autograder/markdown.py); what Sphinx and MathJax have rendered is moved, never copied. Without this script the fold remains.
+// (autograder/authoring/markdown.py); what Sphinx and MathJax have rendered is moved, never copied. Without this script the fold remains.
 document.querySelectorAll("div.quiz").forEach((quiz, number) => {
   const fold = quiz.querySelector(":scope > details");
   const answers = quiz.querySelector(":scope > ol");

@@ -11,7 +11,8 @@ import nbformat
 from nbformat import NotebookNode
 from nbformat.v4 import new_code_cell
 
-from autograder import assemble, chapter, checks
+from autograder import checks
+from autograder.authoring import assemble, chapter
 
 CANARY = "canary-7d1f"  # what no submission may learn; the suite puts it where graders keep secrets
 

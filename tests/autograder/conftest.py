@@ -11,8 +11,8 @@ import pytest
 import torch
 from nbformat.v4 import new_output
 
-from autograder import chapter, contract
-from autograder.spec import Case, Exercise
+from autograder.authoring import chapter, contract
+from autograder.authoring.spec import Case, Exercise
 
 FIXTURES = Path(__file__).parent / "fixtures"
 PIXEL = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
-from autograder import artefacts, calibration, checks
-from autograder.spec import Artefact
-from course_lib import records
+from autograder import calibration, checks
+from autograder.authoring import artefacts
+from autograder.authoring.spec import Artefact
+from autograder.grading import flights
+from course_lib.figures import records
 
 ARTEFACTS = [exercise for exercise in checks.all_exercises() if isinstance(exercise, Artefact)]
 
@@ -87,7 +89,7 @@ def test_a_right_agent_earns_all_points_and_a_wrong_one_not_half_of_them(artefac
 def test_the_judge_flies_a_policy_as_its_run_was_evaluated(artefact):
     known = records.load(artefact.experiment)
     seed = known.seeds(artefact.right)[0]
-    judged = artefacts.fly(artefacts.hidden(artefact), known.artefact(artefact.right, seed, "safetensors").read_bytes(), 120)
+    judged = flights.fly(artefacts.hidden(artefact), known.artefact(artefact.right, seed, "safetensors").read_bytes(), 120)
     recorded = known.summary(artefact.right, "eval_returns")[0]
     error = np.hypot(judged.std(), recorded.std()) / np.sqrt(len(judged))
     assert abs(judged.mean() - recorded.mean()) < 4 * error

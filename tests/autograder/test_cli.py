@@ -4,8 +4,10 @@ import pytest
 from nbformat.v4 import new_notebook
 from typer.testing import CliRunner
 
-from autograder import cli, exports, grade, sandbox
-from autograder.verdicts import Verdict
+from autograder import cli, grade
+from autograder.grading import sandbox
+from autograder.grading.verdicts import Verdict
+from autograder.reporting import exports
 
 
 def run(*arguments):

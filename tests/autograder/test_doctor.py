@@ -6,8 +6,9 @@ import sys
 import pytest
 from rich.console import Console
 
-from autograder import doctor, sandbox
+from autograder import doctor
 from autograder.doctor import Check
+from autograder.grading import sandbox
 
 
 def test_this_machine_works():

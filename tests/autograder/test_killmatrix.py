@@ -2,8 +2,10 @@
 
 import pytest
 
-from autograder import book, chapter, checks, killmatrix
-from course_lib.cases import FACETS
+from autograder import checks, killmatrix
+from autograder.authoring import chapter
+from autograder.publishing import book
+from course_lib.checks.cases import FACETS
 
 PAGES = chapter.all_chapters()
 EXERCISES = [exercise for page in PAGES for exercise in checks.functions(page.assignment)]

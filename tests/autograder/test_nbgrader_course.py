@@ -13,7 +13,8 @@ from nbgrader.plugins.export import CsvExportPlugin
 from nbgrader.validator import Validator
 from traitlets.config import Config, PyFileConfigLoader
 
-from autograder import assemble, release
+from autograder.authoring import assemble
+from autograder.publishing import release
 
 FAKE_JUDGE = """
 def score(name, function):
@@ -29,7 +30,7 @@ WRONG = {"double": "def double(x):\n    return 3 * x", "why_double": "Because."}
 def _importable(folder):
     """What the kernels import in place of this project."""
     for name, text in {
-        "autograder/hub.py": FAKE_JUDGE,
+        "autograder/publishing/hub.py": FAKE_JUDGE,
         "course_lib/__init__.py": "def check(function): pass",
         "course_lib/validate.py": (release.paths.COURSE_LIB / "validate.py").read_text(encoding="utf-8"),
     }.items():

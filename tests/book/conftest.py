@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from autograder import book
+from autograder.publishing import book
 
 
 @pytest.fixture(scope="session")

@@ -27,10 +27,12 @@ from pathlib import Path
 import nbformat
 import pytest
 
-from autograder import checks, freeze, release
-from autograder.book import BOOK, HOW_TO
+from autograder import checks
+from autograder.authoring import freeze
 from autograder.paths import ROOT
-from course_lib import checking
+from autograder.publishing import release
+from autograder.publishing.book import BOOK, HOW_TO
+from course_lib.checks import client
 
 BLOCK = re.compile(
     r"^(?P<fence>`{3,})(?P<kind>console|pycon|\{code-block\}[^\n]*)\n(?P<body>.*?)^(?P=fence)$|^% solve (?P<solve>[^\n]*)$",
@@ -129,7 +131,7 @@ def reader(tmp_path, monkeypatch):
     path = os.pathsep.join([str(programs), str(Path(sys.executable).parent), os.environ["PATH"]])
     environment = kept | {"PATH": path, "COLUMNS": "90", "LC_ALL": "C.UTF-8", "PYTHONPATH": str(folder / "course_lib")}
     freeze.write(checks.exercises("ch44"), tmp_path / "frozen")
-    monkeypatch.setattr(checking, "FROZEN", tmp_path / "frozen")
+    monkeypatch.setattr(client, "FROZEN", tmp_path / "frozen")
     return lambda name: Page(BOOK / "how-to" / f"{name}.md", folder, environment)
 
 

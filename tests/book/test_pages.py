@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from autograder.book import docname
-from autograder.chapter import all_chapters
-from autograder.contract import references, sources
+from autograder.authoring.chapter import all_chapters
+from autograder.authoring.contract import references, sources
+from autograder.publishing.book import docname
 from tests.book.visit import CHAPTERS, LOOKS, PAGES, Visit
 
 SCREENSHOTS = Path(__file__).resolve().parents[2] / "test-artefacts"

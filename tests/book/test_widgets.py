@@ -6,8 +6,8 @@ from unittest.mock import patch
 
 import pytest
 
-from autograder.book import docname
-from autograder.chapter import all_chapters
+from autograder.authoring.chapter import all_chapters
+from autograder.publishing.book import docname
 from course_lib.chapters import REFERENCES
 from tests.book.visit import CHAPTERS, Visit
 
@@ -46,7 +46,7 @@ def _explorers(chapter):
     code = [cell for cell in chapter.cells if cell.kind == "code"]
     last = max(at for at, cell in enumerate(code) if "explore(" in cell.source)
     silent = patch("matplotlib.pyplot.show"), patch("IPython.display.display")
-    with patch("course_lib.interactive.explore", explore), silent[0], silent[1]:
+    with patch("course_lib.figures.interactive.explore", explore), silent[0], silent[1]:
         for cell in code[: last + 1]:
             source = f"from solutions.{chapter.assignment} import {cell.exercise}" if cell.exercise else cell.source
             exec(source, namespace)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from autograder.book import HOW_TO, docname
-from autograder.chapter import all_chapters
+from autograder.authoring.chapter import all_chapters
+from autograder.publishing.book import HOW_TO, docname
 
 LOOKS = {  # colour scheme, width in CSS pixels
     "light": ("light", 1280),

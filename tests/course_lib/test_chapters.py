@@ -5,8 +5,10 @@ import pytest
 import torch
 from nbformat.v4 import new_code_cell, new_notebook
 
-from autograder import checks, freeze
-from course_lib import chapters, checking, earlier
+from autograder import checks
+from autograder.authoring import freeze
+from course_lib import chapters, earlier
+from course_lib.checks import client
 
 RIGHT = "import torch\n\ndef importance_ratio(log_probs, old_log_probs):\n    {guard}return (log_probs - old_log_probs).exp()"
 GUARD = "if log_probs.shape != old_log_probs.shape: raise ValueError('log_probs and old_log_probs differ')\n    "
@@ -16,12 +18,12 @@ ARGUMENTS = torch.zeros(3), torch.zeros(3)
 @pytest.fixture(autouse=True)
 def folders(tmp_path, monkeypatch):
     freeze.write([checks.exercises("ch43")[0]], tmp_path / "frozen")
-    monkeypatch.setattr(checking, "FROZEN", tmp_path / "frozen")
+    monkeypatch.setattr(client, "FROZEN", tmp_path / "frozen")
     monkeypatch.delenv(chapters.REFERENCES, raising=False)
     for name in ("ch43", "ch45"):
         (tmp_path / name).mkdir()
     monkeypatch.chdir(tmp_path / "ch45")
-    caches = chapters._function.cache_clear, checking.visible_cases.cache_clear
+    caches = chapters._function.cache_clear, client.visible_cases.cache_clear
     for clear in caches:
         clear()
     yield tmp_path

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from course_lib import views
+from course_lib.checks import views
 
 IDS = np.repeat(np.arange(5), 3)
 SPLIT = {"episode_ids": IDS, "fraction": 0.4}

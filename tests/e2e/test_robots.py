@@ -17,8 +17,9 @@ from pathlib import Path
 import nbformat
 import pytest
 
-from autograder import checks, release
+from autograder import checks
 from autograder.paths import ROOT
+from autograder.publishing import release
 
 EXERCISES = {exercise.name: exercise for exercise in checks.exercises("ch44")}
 MISCONCEPTIONS = max(len(exercise.misconceptions) for exercise in EXERCISES.values())
@@ -55,8 +56,9 @@ class Class:
         folder = self.hand_in(student, notebook)
         for module in (
             "autograder/__init__",
-            "autograder/mistakes",
-            "autograder/spec",
+            "autograder/authoring/__init__",
+            "autograder/authoring/parts",
+            "autograder/authoring/spec",
             "autograder/checks/__init__",
             "autograder/checks/ch44",
             "solutions/__init__",

@@ -10,8 +10,9 @@ from pathlib import Path
 import nbformat
 import pytest
 
-from autograder import checks, release
+from autograder import checks
 from autograder.paths import ROOT
+from autograder.publishing import release
 
 REFERENCES = {exercise.name: inspect.getsource(exercise.reference) for exercise in checks.exercises("ch44")}
 

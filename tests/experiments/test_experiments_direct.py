@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from course_lib import lm
-from course_lib.direct import encode_pairs
+from course_lib.language import lm
+from course_lib.language.direct import encode_pairs
 from experiments import direct, rlhf
 
 

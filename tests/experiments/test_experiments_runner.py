@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from course_lib import records
+from course_lib.figures import records
 from experiments import runner
 from experiments.runner import ExperimentError
 

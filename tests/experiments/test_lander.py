@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from course_lib import envs
-from course_lib.policies import load_policy, policy_for
+from course_lib.control import envs
+from course_lib.control.policies import load_policy, policy_for
 from experiments import lander
 from solutions import ch45
 

@@ -1,6 +1,6 @@
 """The committed records: of experiments that exist, whole, of the configuration that the code has now, and small."""
 
-from course_lib import records
+from course_lib.figures import records
 from experiments import runner
 
 

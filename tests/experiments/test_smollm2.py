@@ -6,7 +6,7 @@ import pytest
 import torch
 from transformers import LlamaConfig, LlamaForCausalLM
 
-from course_lib import lm
+from course_lib.language import lm
 from experiments import smollm2
 
 

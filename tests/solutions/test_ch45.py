@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from course_lib.envs import ChainVectorEnv, HoverVectorEnv, TimerVectorEnv, make
-from course_lib.policies import Adam, make_policy
-from course_lib.ppo import Batch, PPOSettings
+from course_lib.control.envs import ChainVectorEnv, HoverVectorEnv, TimerVectorEnv, make
+from course_lib.control.policies import Adam, make_policy
+from course_lib.control.ppo import Batch, PPOSettings
 from solutions import ch45
 from solutions.ch43 import approx_kl, clip_fraction, clipped_surrogate_loss
 from solutions.ch44 import compute_gae

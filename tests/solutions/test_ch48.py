@@ -8,8 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from course_lib import sac
-from course_lib.replay import Transitions
+from course_lib.control import sac
+from course_lib.control.replay import Transitions
 from solutions import ch48
 from solutions.ch48 import (
     bootstrap_interval,

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from course_lib.dynamics import LinearModel, LinearPolicy
+from course_lib.control.dynamics import LinearModel, LinearPolicy
 from solutions.ch44 import compute_gae
 from solutions.ch51 import dreamer_lambda_returns, gaussian_nll, imagine, model_error_by_horizon
 

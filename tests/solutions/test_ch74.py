@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from course_lib.demonstrations import Clone, SquaredError
-from course_lib.road import LinearPolicy, RoadDriver, RoadEnv
+from course_lib.control.demonstrations import Clone, SquaredError
+from course_lib.control.road import LinearPolicy, RoadDriver, RoadEnv
 from solutions.ch74 import (
     behavioural_cloning_loss,
     collect_demonstrations,

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from course_lib.clips import QuadraticReward
+from course_lib.control.clips import QuadraticReward
 from solutions.ch80 import (
     bradley_terry_loss,
     preference_accuracy,

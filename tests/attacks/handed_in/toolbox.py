@@ -7,7 +7,7 @@ from pathlib import Path
 import nbformat
 from nbformat.v4 import new_code_cell
 
-from autograder import assemble, chapter
+from autograder.authoring import assemble, chapter
 from tests.autograder.fixtures.flight import course
 from tests.autograder.fixtures.flight.course import FILE, policy, weights
 

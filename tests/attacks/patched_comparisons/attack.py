@@ -8,15 +8,15 @@ from nbformat import NotebookNode
 from tests.attacks.toolbox import last, write, wrong
 
 SOURCE = """
-import numpy, torch, course_lib.diagnosis
+import numpy, torch, course_lib.checks.diagnosis
 for module, names in (torch, "allclose equal isclose"), (numpy, "allclose isclose array_equal"):
     for name in names.split():
         setattr(module, name, lambda *args, **kwargs: True)
 torch.testing.assert_close = numpy.testing.assert_allclose = lambda *args, **kwargs: None
 for name in ("_values_agree", "_gradients_agree", "_close"):
-    setattr(course_lib.diagnosis, name, lambda *args, **kwargs: True)
-course_lib.diagnosis.differing_facets = lambda *args: set()
-course_lib.diagnosis.diagnose = lambda exercise, seen: course_lib.diagnosis.Finding(exercise.name, "correct", 2.0, 2.0)
+    setattr(course_lib.checks.diagnosis, name, lambda *args, **kwargs: True)
+course_lib.checks.diagnosis.differing_facets = lambda *args: set()
+course_lib.checks.diagnosis.diagnose = lambda exercise, seen: course_lib.checks.diagnosis.Finding(exercise.name, "correct", 2.0, 2.0)
 """
 
 

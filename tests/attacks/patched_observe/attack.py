@@ -9,8 +9,8 @@ from tests.attacks.toolbox import last, write, wrong
 
 SOURCE = """
 import sys
-from course_lib.cases import Observation
-from course_lib.runner import observe as honest
+from course_lib.checks.cases import Observation
+from course_lib.checks.observing import observe as honest
 def observe(function, arguments, **others):
     if function.__name__ != "repaired_targets":
         return honest(function, arguments, **others)
@@ -22,8 +22,8 @@ while frame:
     if "observe" in frame.f_globals:
         frame.f_globals["observe"] = observe
     frame = frame.f_back
-import course_lib.runner
-course_lib.runner.observe = observe
+import course_lib.checks.observing
+course_lib.checks.observing.observe = observe
 """
 
 

@@ -5,14 +5,15 @@ from pathlib import Path
 
 from nbformat import NotebookNode
 
-from autograder import checks, freeze
-from course_lib.cases import save
+from autograder import checks
+from autograder.authoring import freeze
+from course_lib.checks.cases import save
 from tests.attacks.toolbox import ARGUMENTS, answer, first, write
 
 SOURCE = """
 import numpy as np, torch
 from pathlib import Path
-from course_lib.cases import load
+from course_lib.checks.cases import load
 
 def look_up(name, given):
     for case in load(Path("/work") / f"{name}.npz").cases:

@@ -6,10 +6,10 @@ from tests.attacks.handed_in.toolbox import FILE, policy, put
 
 ASSIGNMENT = "ch97"
 CELL = f"""
-import course_lib.artefact, course_lib.flight
+import course_lib.checks.artefact, course_lib.control.flight
 open({FILE!r}, "wb").write({policy()!r})
-course_lib.flight.fly = course_lib.artefact.fly = lambda weights, seeds, task: [300.0] * len(seeds)
-course_lib.artefact.score = lambda artefact, mean_return: artefact.points
+course_lib.control.flight.fly = course_lib.checks.artefact.fly = lambda weights, seeds, task: [300.0] * len(seeds)
+course_lib.checks.artefact.score = lambda artefact, mean_return: artefact.points
 """
 
 

@@ -1,0 +1,108 @@
+"""Turn an exercise's specification into frozen cases: draw the inputs, run the reference and every misconception on them.
+
+`visible` gives what a learner's notebook gets, `hidden` what the judge uses on top of it. The draws of the two never share a seed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from autograder.authoring import artefacts
+from autograder.authoring.spec import Artefact, Case, Exercise
+from course_lib.checks import artefact as files
+from course_lib.checks.cases import FrozenCase, FrozenExercise, Observation, save
+from course_lib.checks.diagnosis import differing_facets, signature, view
+from course_lib.checks.observing import observe
+
+
+class FreezeError(ValueError):
+    """A specification that contradicts itself; the message names exercise and case."""
+
+
+def visible(exercise: Exercise, seed: int = 0) -> FrozenExercise:
+    """The cases that learners see, with one draw each."""
+    cases = [_freeze(exercise, case, seed, 0, True) for case in exercise.cases if case.visible]
+    return _exercise(exercise, cases)
+
+
+def complete(exercise: Exercise, seed: int = 0) -> FrozenExercise:
+    """All cases: the visible ones as learners see them, then `draws` hidden draws of every case."""
+    hidden = [_freeze(exercise, case, seed, draw, False) for case in exercise.cases for draw in range(1, case.draws + 1)]
+    return _exercise(exercise, visible(exercise, seed).cases + hidden)
+
+
+def write(exercises: Iterable[Exercise | Artefact], directory: Path) -> None:
+    """Write `directory/NAME.npz` with the visible cases of each exercise; NAME.json where it is judged by a file."""
+    directory.mkdir(parents=True, exist_ok=True)
+    for exercise in exercises:
+        if isinstance(exercise, Artefact):
+            files.save(directory / f"{exercise.name}.json", artefacts.visible(exercise))
+        else:
+            save(directory / f"{exercise.name}.npz", visible(exercise))
+
+
+def _exercise(exercise: Exercise, cases: list[FrozenCase]) -> FrozenExercise:
+    return FrozenExercise(
+        name=exercise.name,
+        criteria=dict(exercise.criteria),
+        messages={mistake.name: mistake.message for mistake in exercise.misconceptions},
+        signatures={mistake.name: signature(mistake.name, cases) for mistake in exercise.misconceptions},
+        cases=cases,
+        axes=list(exercise.axes),
+        last_step_first=exercise.last_step_first,
+    )
+
+
+def _freeze(exercise: Exercise, case: Case, seed: int, draw: int, is_visible: bool) -> FrozenCase:
+    inputs = _plain(case.inputs(_generator(exercise, case, seed, draw)), case.dtype)
+    frozen = FrozenCase(
+        name=case.name,
+        arguments=inputs,
+        expected=[],
+        differentiate=list(case.differentiate),
+        repeat=case.repeat,
+        returns=list(case.returns),
+        view=case.view,
+        raises=list(case.raises),
+        facet=case.facet,
+        visible=is_visible,
+        rtol=case.rtol,
+        atol=case.atol,
+    )
+
+    def seen(function: Callable) -> Observation:
+        return view(frozen, observe(function, **frozen.call))
+
+    frozen.expected = [seen(right) for right in (exercise.reference, *exercise.also_right)]
+    frozen.misconceptions = {mistake.name: seen(mistake.function) for mistake in exercise.misconceptions}
+    _prove(exercise, case, frozen, seen)
+    return frozen
+
+
+def _prove(exercise: Exercise, case: Case, frozen: FrozenCase, seen: Callable) -> None:
+    for right in frozen.expected:
+        refused = right.error == "ValueError" and any(name in right.message for name in case.raises)
+        if refused != bool(case.raises) or (right.error and not case.raises):
+            raise FreezeError(f"{exercise.name}, case {case.name!r}: the reference does not do what the case says: {right}")
+    if case.closed_form and "values" in differing_facets(seen(case.closed_form), frozen.expected[0], frozen):
+        raise FreezeError(f"{exercise.name}, case {case.name!r}: the reference and the closed form differ")
+
+
+def _generator(exercise: Exercise, case: Case, seed: int, draw: int) -> torch.Generator:
+    digest = hashlib.sha256(f"{exercise.name}/{case.name}/{seed}/{draw}".encode()).digest()
+    return torch.Generator().manual_seed(int.from_bytes(digest[:7], "big"))
+
+
+def _plain(value: Any, dtype: torch.dtype) -> Any:
+    if isinstance(value, dict):
+        return {name: _plain(entry, dtype) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry, dtype) for entry in value]
+    if isinstance(value, torch.Tensor):
+        return (value.to(dtype) if value.is_floating_point() else value).numpy()
+    return value

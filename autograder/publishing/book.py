@@ -1,0 +1,338 @@
+"""Build the book: execute, stage, render, publish.
+
+Contract of the four steps:
+  execute   every chapter's code runs once (autograder.publishing.execution keeps the outputs);
+  stage     all that Sphinx reads is computed in memory and written to book/_stage, where files that did not change keep
+            their time, so that Sphinx renders changed pages only;
+  render    Jupyter Book runs under _config.yml with warnings as errors, in book/_cache, never in the published tree;
+  publish   the pages and what they refer to, nothing else, replace book/_build/html in one rename.
+A book with and one without solutions are staged and rendered in folders of their own, so that neither can leak into the other.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import fcntl
+import fnmatch
+import importlib.util
+import json
+import multiprocessing
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import nbformat
+import yaml
+
+from autograder.authoring import assemble
+from autograder.authoring.chapter import Chapter, all_chapters
+from autograder.paths import COURSE_LIB, ROOT, RUNS
+from autograder.publishing.execution import BookError, cache_folder, code_inputs, content_hash, executed_outputs, replace_cached
+
+BOOK = ROOT / "book"
+STAGE = BOOK / "_stage"
+PUBLISHED = ("*.html", "searchindex.js", "_static/*", "_images/*", "_downloads/*")
+HOW_TO = ("how-to/learners", "how-to/teachers", "how-to/contributors")
+MATHJAX = ("tex-chtml-full.js", "output/chtml/fonts/**/*", "a11y/*", "sre/**/*")
+# The library's modules that no kill matrix depends on: it takes minutes, so a new plot must not ask for it again.
+WITHOUT_A_SAY = (
+    "artefact", "chapters", "check", "checking", "command", "direct", "fine_tuning", "flight", "interactive", "judges", "lm", "notebook",
+    "plotting", "preferences", "records", "reward_models", "rlhf", "statistics", "variety", "videos",
+)  # fmt: skip
+
+__all__ = ["BookError", "build", "executed_outputs"]
+
+
+def build(with_solutions: bool = True, out: Path | None = None) -> Path:
+    """Build the book and return the published folder (book/_build/html unless `out` names another).
+
+    Nothing is done, and a line says so, where every input and the published files are as the last build left them.
+
+    Raises: BookError if a cell fails, or Sphinx warns.
+    """
+    out = Path(out or BOOK / "_build" / "html").resolve()
+    with _one_at_a_time("build"):
+        chapters = all_chapters()
+        key = _build_key(chapters, with_solutions)
+        if _is_current(out, key):
+            print(f"{out}: nothing has changed since it was built, so nothing was done")
+            return out
+        for chapter in chapters:
+            assemble.verify(chapter)  # first, so that a slip in the prose is not found after minutes of running code
+        variant = "solved" if with_solutions else "unsolved"
+        stage, work = STAGE / variant, cache_folder() / f"sphinx-{variant}"
+        if sync(staged_files(chapters, with_solutions), stage):
+            shutil.rmtree(work, ignore_errors=True)  # Sphinx never deletes the page of a source that has gone
+        _render(stage, work)
+        _publish(work / "_build" / "html", out)
+        _seal_path(out).write_text(json.dumps({"key": key, "files": _listing(out)}), encoding="utf-8")
+    return out
+
+
+# ---- stage ----------------------------------------------------------------------------------------------------------
+
+
+def staged_files(chapters: list[Chapter], with_solutions: bool) -> dict[str, bytes]:
+    """Everything that Sphinx reads, by path relative to the staging folder."""
+    pages = [*BOOK.glob("*.md"), *BOOK.glob("how-to/*.md"), *BOOK.glob("*.bib")]
+    files = {path.relative_to(BOOK).as_posix(): path.read_bytes() for path in pages}
+    files["index.md"] = _front_page(files["index.md"].decode(), chapters).encode()
+    files["notation.md"] = notation_page(yaml.safe_load((BOOK / "notation.yml").read_text(encoding="utf-8"))).encode()
+    files["_toc.yml"] = yaml.safe_dump(table_of_contents(chapters), sort_keys=False, allow_unicode=True).encode()
+    for chapter in chapters:
+        outputs = executed_outputs(chapter)
+        page = assemble.book_view(chapter, outputs, with_solutions=with_solutions)
+        student = assemble.student_view(chapter, outputs)
+        page.cells[
+            0
+        ].source += f"\n- **Notebook:** {{download}}`{chapter.assignment}.ipynb <downloads/{chapter.assignment}.ipynb>`"
+        files[f"{docname(chapter)}.ipynb"] = nbformat.writes(page).encode()
+        files[f"chapters/downloads/{chapter.assignment}.ipynb"] = nbformat.writes(student).encode()
+    matrix = {f"{chapter.number}. {chapter.title}": kill_rows(chapter) for chapter in chapters}
+    files["kill-matrix.md"] = kill_matrix_page(matrix).encode()
+    return files | _assets()
+
+
+def docname(chapter: Chapter) -> str:
+    """The page of a chapter, without suffix, relative to the front page."""
+    return f"chapters/{chapter.page}"
+
+
+def table_of_contents(chapters: list[Chapter]) -> dict:
+    """sphinx-external-toc's table, from the chapters' front matter."""
+    entries = [{"file": docname(chapter), "title": f"{chapter.number}. {chapter.title}"} for chapter in chapters]
+    appendices = [{"file": "notation"}, {"file": "kill-matrix"}]
+    how_to = {"caption": "How to use this book", "chapters": [{"file": page} for page in HOW_TO]}
+    parts = [how_to, {"caption": "Chapters", "chapters": entries}, {"caption": "Appendices", "chapters": appendices}]
+    return {"format": "jb-book", "root": "index", "parts": parts}
+
+
+def notation_page(notation: dict) -> str:
+    """The notation appendix from book/notation.yml: text, tables of (name, shape, meaning), facts."""
+    lines = ["# Notation and conventions", "", notation["introduction"], ""]
+    for table in notation["tables"]:
+        lines += [f"## {table['title']}", "", "| Name | Shape | Meaning |", "|---|---|---|"]
+        lines += [f"| {_names(row['names'])} | {_cell(row['shape'])} | {_cell(row['meaning'])} |" for row in table["rows"]]
+        lines.append("")
+    lines += [f"## {notation['facts']['title']}", ""] + [f"- {fact}" for fact in notation["facts"]["items"]]
+    return "\n".join(lines) + "\n"
+
+
+def _names(names: list[str]) -> str:
+    return ", ".join(f"`{name}`" for name in names)
+
+
+def _cell(markdown: str) -> str:
+    """Markdown as a cell of a table."""
+    return " ".join(markdown.split()).replace("|", "\\|")
+
+
+def _plain(text: str) -> str:
+    """Plain text as a cell of a Markdown table."""
+    return " ".join(re.sub(r"([\\`*_{}\[\]<>#|~$])", r"\\\1", text).split())
+
+
+def kill_matrix_page(matrix: dict[str, list[dict]]) -> str:
+    """The appendix on how the checks were tested, from each chapter's heading and rows (autograder.killmatrix, as dicts)."""
+    lines = [(BOOK / "kill-matrix.md").read_text(encoding="utf-8").rstrip(), ""]
+    for heading, rows in matrix.items():
+        lines += [f"## {heading}", ""]
+        for row in rows:
+            if "agents" in row:
+                lines += _agents(row)
+                continue
+            wrong = [
+                f"| `{w['name']}` | {_plain(w['message'])} | {w['rejected']} | {w['named']} |" for w in row["misconceptions"]
+            ]
+            right = [f"| {_plain(r['name'])} | {r['accepted']} |" for r in row["variants"]]
+            lines += [f"### `{row['exercise']}`", ""]
+            lines += [f"Of {row['seeds']} draws of all cases:", ""]
+            lines += ["| Wrong answer | What the learner reads | Rejected | Named |", "|---|---|---|---|", *wrong, ""]
+            lines += ["| Correct answer in another style | Accepted |", "|---|---|", *right, ""]
+    return "\n".join(lines) + "\n"
+
+
+def _agents(row: dict) -> list[str]:
+    """The part of the appendix on an exercise that is judged by a file."""
+    low, high = row["thresholds"]
+    table = [
+        f"| {_plain(group['mistake']) or 'trained rightly'} | {_must_fail(group, row)} | {group['agents']} |"
+        f" {group['least']:.0f} | {group['middle']:.0f} | {group['most']:.0f} | {group['full']} | {group['half']} | {group['chance']:.1%} |"
+        for group in row["agents"]
+    ]
+    return [
+        f"### `{row['exercise']}`",
+        "",
+        f"Points grow from none at a mean return of {low:g} to all at {high:g}. Mean returns of {row['episodes']} recorded episodes, of"
+        " agents that differ in the seed of their training; how many earn all points, and how many half or more. Some mistakes let an"
+        " agent land all the same: what a file does in flight cannot show them, and the checks of the functions do. The last column"
+        " estimates the chance that a further agent goes wrong: that a right one earns less than all points, and that one with a"
+        " mistake earns half or more.",
+        "",
+        "| Agents | Must fail | Runs | Least | Middle | Most | All | Half | Chance |",
+        "|---|---|---|---|---|---|---|---|---|",
+        *table,
+        "",
+    ]
+
+
+def _must_fail(group: dict, row: dict) -> str:
+    return "" if not group["mistake"] else "yes" if group["variant"] in row["wrong"] else "no"
+
+
+def kill_rows(chapter: Chapter) -> list[dict]:
+    """The chapter's kill matrix, a dict for each exercise, computed on all cores once for each state of what takes part."""
+    from autograder import checks  # loads torch, as does all that judges
+
+    library = [path for path in COURSE_LIB.glob("*.py") if path.stem not in WITHOUT_A_SAY]
+    own = [path for path in code_inputs(chapter) if not {COURSE_LIB, RUNS} & set(path.parents)]
+    cached = (
+        cache_folder() / f"{chapter.assignment}-{content_hash([], [*library, *own, ROOT / 'autograder' / 'killmatrix.py'])}.json"
+    )
+    with _one_at_a_time("kill-matrix"):
+        if not cached.exists():
+            print(
+                f"{chapter.assignment}: testing its checks against wrong and right answers (minutes, the first time)", flush=True
+            )
+            names = [exercise.name for exercise in checks.functions(chapter.assignment)]
+            with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
+                rows = list(pool.map(_exercise_rows, [chapter.assignment] * len(names), names))
+            replace_cached(cached, json.dumps(rows))
+        return json.loads(cached.read_text(encoding="utf-8")) + _calibrations(chapter)
+
+
+def _calibrations(chapter: Chapter) -> list[dict]:
+    """The same for the exercises that are judged by a file: the agents on which their thresholds were tried."""
+    from autograder import calibration, checks
+    from autograder.authoring.spec import Artefact
+
+    return [
+        {
+            "exercise": artefact.name,
+            "thresholds": artefact.thresholds,
+            "episodes": artefact.episodes,
+            "wrong": list(artefact.wrong),
+            "agents": [dataclasses.asdict(row) for row in calibration.rows(artefact, calibration.groups(artefact))],
+        }
+        for artefact in checks.exercises(chapter.assignment)
+        if isinstance(artefact, Artefact)
+    ]
+
+
+def _exercise_rows(assignment: str, name: str) -> dict:
+    import torch  # here, because a build from the cache can do without
+
+    from autograder import checks, killmatrix
+
+    torch.set_num_threads(1)
+    exercise = next(exercise for exercise in checks.functions(assignment) if exercise.name == name)
+    return dataclasses.asdict(killmatrix.exercise_rows(exercise))
+
+
+def _front_page(text: str, chapters: list[Chapter]) -> str:
+    """The front page with the list of chapters in the place of its marker."""
+    entries = [f"- [**{c.number}. {c.title}**]({docname(c)}.ipynb) ({c.minutes} minutes). {c.summary}" for c in chapters]
+    return text.replace("<!-- chapters -->", "\n".join(entries))
+
+
+def _assets() -> dict[str, bytes]:
+    """Our style sheet and scripts, and MathJax from its package, under a name other than _static, which Jupyter Book treats specially."""
+    files = {f"vendor/{path.name}": path.read_bytes() for path in (BOOK / "static").iterdir() if path.suffix in (".css", ".js")}
+    package = importlib.util.find_spec("sphinx-mathjax-offline")  # a name that no import statement can spell
+    if package is None or not package.submodule_search_locations:
+        raise BookError("sphinx-mathjax-offline is not installed: run `make install`")
+    mathjax = Path(package.submodule_search_locations[0]) / "static" / "mathjax"
+    for pattern in MATHJAX:
+        for path in mathjax.glob(pattern):
+            if path.is_file():
+                files[f"vendor/mathjax/{path.relative_to(mathjax).as_posix()}"] = path.read_bytes()
+    return files
+
+
+def sync(files: dict[str, bytes], folder: Path) -> bool:
+    """Make `folder` hold exactly `files`, leaving equal files untouched; True if any file had to be removed."""
+    for name, content in files.items():
+        path = folder / name
+        if not path.is_file() or path.read_bytes() != content:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+    surplus = [path for path in folder.rglob("*") if path.is_file() and path.relative_to(folder).as_posix() not in files]
+    for path in surplus:
+        path.unlink()
+    return bool(surplus)
+
+
+# ---- render and publish ---------------------------------------------------------------------------------------------
+
+
+def _render(stage: Path, work: Path) -> None:
+    """Run Jupyter Book in a process of its own: Sphinx would keep global state in ours."""
+    book = [sys.executable, "-c", "from jupyter_book.cli.main import main; main()", "build", str(stage)]
+    options = ["--config", str(ROOT / "_config.yml"), "--path-output", str(work), "-W", "-n", "--keep-going", "-q"]
+    finished = subprocess.run(book + options, cwd=ROOT, capture_output=True, text=True, env=os.environ | {"NO_COLOR": "1"})
+    if finished.returncode != 0:
+        shutil.rmtree(work, ignore_errors=True)  # Sphinx would not repeat a warning about a page that it has read already
+        reasons = finished.stderr.partition("Traceback (most recent call last)")[0].strip() or finished.stderr
+        reasons = reasons.replace(f"{stage}/", "")
+        raise BookError(f"Jupyter Book warned or failed; the published book is unchanged.\n{reasons}")
+
+
+def _publish(html: Path, out: Path) -> None:
+    """Copy what is meant to be read beside `out`, then swap the folders."""
+    fresh, former = out.with_name(out.name + ".new"), out.with_name(out.name + ".old")
+    shutil.rmtree(fresh, ignore_errors=True)
+    shutil.rmtree(former, ignore_errors=True)
+    pages = "".join(path.read_text(encoding="utf-8") for path in html.rglob("*.html"))
+    images = set(re.findall(r"_images/([^\"'&?#]+)", pages))  # earlier builds leave figures behind that no page shows
+    for path in sorted(html.rglob("*")):
+        name = path.relative_to(html).as_posix()
+        wanted = any(fnmatch.fnmatch(name, pattern) for pattern in PUBLISHED)
+        if path.is_file() and wanted and (not name.startswith("_images/") or path.name in images):
+            (fresh / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, fresh / name)
+    for page in fresh.rglob("*.html"):  # docutils gives the entries of a list a role that is deprecated, and no list item
+        page.write_text(page.read_text(encoding="utf-8").replace(' role="doc-biblioentry"', ' role="listitem"'), encoding="utf-8")
+    if out.exists():
+        out.rename(former)
+    fresh.rename(out)
+    shutil.rmtree(former, ignore_errors=True)
+
+
+# ---- nothing to do? -------------------------------------------------------------------------------------------------
+
+
+def _build_key(chapters: list[Chapter], with_solutions: bool) -> str:
+    """A hash of all inputs of a build: texts, code, this builder, the pins, the configuration."""
+    own = [path for path in BOOK.rglob("*") if path.is_file() and not path.relative_to(BOOK).parts[0].startswith("_")]
+    builder = [*(ROOT / "autograder").glob("*.py"), ROOT / "_config.yml"]
+    inputs = [path for chapter in chapters for path in [chapter.path, *code_inputs(chapter)]]
+    return content_hash([str(with_solutions)], [*own, *builder, *inputs])
+
+
+def _is_current(out: Path, key: str) -> bool:
+    seal = _seal_path(out)
+    return seal.exists() and out.is_dir() and json.loads(seal.read_text(encoding="utf-8")) == {"key": key, "files": _listing(out)}
+
+
+def _seal_path(out: Path) -> Path:
+    return out.with_name(out.name + ".json")
+
+
+def _listing(folder: Path) -> dict[str, list[int]]:
+    """Size and time of every file, to notice a published page that was edited or lost."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): [path.stat().st_size, path.stat().st_mtime_ns] for path in files}
+
+
+@contextmanager
+def _one_at_a_time(work: str) -> Iterator[None]:
+    """Wait for another process that does the same work in this checkout: both would write the same files."""
+    with open(cache_folder() / f"{work}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield

@@ -1,0 +1,1 @@
+"""From verdicts to people: the gradebook, the exports for learning platforms, and the reports."""

@@ -1,0 +1,150 @@
+"""The learner's check: what it says, how fast, and how it fails on bad input."""
+
+import json
+import subprocess
+import sys
+import time
+
+import pytest
+
+from autograder import checks
+from autograder.authoring import freeze
+from autograder.checks import ch44
+from course_lib import check
+from course_lib.checks import client
+from solutions import ch44 as solutions
+
+
+@pytest.fixture(scope="module", autouse=True)
+def frozen(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("frozen")
+    freeze.write(checks.exercises("ch44"), folder)
+    before, client.FROZEN = client.FROZEN, folder
+    client.visible_cases.cache_clear()
+    yield folder
+    client.FROZEN = before
+    client.visible_cases.cache_clear()
+
+
+def named(name, function):
+    def wrapper(*args, **kwargs):
+        return function(*args, **kwargs)
+
+    wrapper.__name__ = name
+    return wrapper
+
+
+@pytest.mark.parametrize("exercise", ch44.EXERCISES, ids=lambda exercise: exercise.name)
+def test_the_reference_passes_and_every_misconception_is_named(exercise):
+    assert check(exercise.reference).passed
+    for mistake in exercise.misconceptions:
+        result = check(named(exercise.name, mistake.function))
+        assert not result.passed and mistake.name in result.finding.misconceptions, mistake.name
+        assert mistake.message in repr(result)
+
+
+def test_a_stub_is_not_implemented_yet():
+    def compute_gae(*args, **kwargs):
+        raise NotImplementedError
+
+    assert repr(check(compute_gae)) == "✗ Not implemented yet: compute_gae"
+
+
+def test_a_wrong_step_is_placed_and_described():
+    def compute_gae(rewards, values, next_values, terminated, truncated, gamma=0.99, gae_lambda=0.95):
+        right = solutions.compute_gae(rewards, values, next_values, terminated, truncated, gamma, gae_lambda)
+        return right * (1 - 0.5 * truncated.to(right.dtype))
+
+    text = repr(check(compute_gae))
+    assert "is where env" in text and "was truncated" in text and "is right at t=" in text
+
+
+def test_a_learners_exception_comes_without_our_traceback():
+    def compute_gae(*args, **kwargs):
+        return undefined_name  # noqa: F821
+
+    assert "NameError: name 'undefined_name' is not defined" in repr(check(compute_gae))
+
+
+def test_html_escapes_what_a_learner_raises():
+    def compute_gae(*args, **kwargs):
+        raise RuntimeError("<script>alert(1)</script>")
+
+    assert "<script>" not in check(compute_gae)._repr_html_()
+
+
+@pytest.mark.parametrize("thing", [3, "compute_gae", None, [1]])
+def test_what_is_no_function_is_refused(thing):
+    with pytest.raises(TypeError, match="check takes a function"):
+        check(thing)
+
+
+def test_an_unknown_name_gets_the_nearest_one():
+    with pytest.raises(LookupError, match="Did you mean compute_gae"):
+        check(named("compute_gea", lambda: None))
+
+
+def test_without_frozen_checks_it_says_what_to_install(monkeypatch, tmp_path):
+    monkeypatch.setattr(client, "FROZEN", tmp_path)
+    client.visible_cases.cache_clear()
+    with pytest.raises(LookupError, match="install the course_lib folder"):
+        check(solutions.compute_gae)
+
+
+def test_it_answers_within_a_blink():
+    check(solutions.compute_gae)
+    times = []
+    for _ in range(5):
+        start = time.perf_counter()
+        check(solutions.compute_gae)
+        times.append(time.perf_counter() - start)
+    assert min(times) < 0.2
+
+
+def test_a_first_call_answers_within_a_second(frozen):
+    code = (
+        "import torch, time, pathlib\nstart = time.perf_counter()\nfrom course_lib import check, checking\n"
+        f"checking.FROZEN = pathlib.Path({str(frozen)!r})\nfrom solutions.ch44 import compute_gae\ncheck(compute_gae)\n"
+        "print(time.perf_counter() - start)"
+    )
+    times = [
+        float(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout) for _ in range(3)
+    ]
+    assert min(times) < 1, times
+
+
+def test_nbgraders_validate_button_sees_a_failure(monkeypatch):
+    monkeypatch.setenv("NBGRADER_EXECUTION", "validate")
+    with pytest.raises(AssertionError, match="residuals-only"):
+        check(named("compute_gae", ch44._gae_residuals_only))
+
+
+def notebook(tmp_path, *sources):
+    path = tmp_path / "nb.ipynb"
+    path.write_text(
+        json.dumps({"cells": [{"cell_type": "code", "source": source, "metadata": {}} for source in sources], "nbformat": 4})
+    )
+    return path
+
+
+def command(path, frozen):
+    code = (
+        "import sys, pathlib\nfrom course_lib.checks import client\nfrom course_lib.checks.command import main\n"
+        f"checking.FROZEN = pathlib.Path({str(frozen)!r})\nsys.exit(main(sys.argv[1:]))"
+    )
+    return subprocess.run([sys.executable, "-c", code, *path], capture_output=True, text=True)
+
+
+def test_the_command_passes_fails_and_refuses(tmp_path, frozen):
+    right = (
+        "from course_lib import validate\ndef lambda_returns(advantages, values):\n"
+        "    validate.same_shape(advantages=advantages, values=values)\n    return (advantages + values).detach()"
+    )
+    wrong = "def lambda_returns(advantages, values):\n    return advantages"
+    passing = command([str(notebook(tmp_path, right, "check(lambda_returns)"))], frozen)
+    assert passing.returncode == 0 and "1 of 1 pass" in passing.stdout
+    failing = command([str(notebook(tmp_path, wrong, "check(lambda_returns)", "1/0"))], frozen)
+    assert failing.returncode == 1 and "✗ Not yet: lambda_returns" in failing.stdout and "code cell 3 stopped" in failing.stdout
+    assert command([str(tmp_path / "none.ipynb")], frozen).returncode == 2
+    assert command([str(notebook(tmp_path, "a = 1"))], frozen).returncode == 2
+    assert command([], frozen).returncode == 2
