@@ -103,11 +103,12 @@ def judge_folder(student: str, assignment: str, folder: Path, timeout: float, tr
     """
     if assignment not in judge.assignments():
         return judge.unknown_assignment(intake.Submission(student, assignment, folder)), None
-    submission = intake.read(student, assignment, folder)
+    submission = intake.Submission(student, assignment, folder)
     release = judge.released(assignment)
     failure: Exception | None = None
     for _ in range(ATTEMPTS):
         try:
+            submission = intake.read(student, assignment, folder)
             return judge.judge(submission, release, timeout, trusted), submission.notebook
         except Exception as error:
             failure = error

@@ -26,6 +26,7 @@ LEARNER_PACKAGES = (
     "torch",
     "numpy",
     "matplotlib",
+    "ipython",
     "ipywidgets",
     "gymnasium[box2d,mujoco]",
     "pyarrow",

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,8 @@ from autograder import checks
 from autograder.authoring import artefacts, assemble, chapter, freeze
 from autograder.authoring.spec import Artefact
 from autograder.grading import flights, intake
-from autograder.grading.sandbox import Sandbox, SandboxDied, SandboxError, SandboxGarbage, SandboxTimeout
+from autograder.grading.attempts import Attempt, Past, plan, share, suspect
+from autograder.grading.sandbox import Sandbox, SandboxDied, SandboxError, SandboxGarbage, SandboxTimeout, SandboxUnavailable
 from autograder.grading.verdicts import Item, Verdict, clean_text
 from autograder.paths import ROOT
 from course_lib.checks.artefact import FrozenArtefact
@@ -38,6 +39,8 @@ START_SECONDS = 120.0  # importing torch on a busy machine; nothing of the learn
 GRACE_SECONDS = 5.0  # how much longer the judge waits than the worker's own timer
 MAX_TEXT = 4 << 20  # bytes of a worker's answer that are not numbers; honest ones have a hundredth of it
 SLACK_SECONDS = 10.0  # for starting sandboxes, on top of (exercises + 1) * timeout
+NOT_COMPARED = "could_not_compare"  # begins the flag of an answer that our comparison did not survive
+ENDINGS = {"did_not_finish": ("timeout", "did not finish in time"), "ended_the_process": ("error", "ended its process")}
 
 
 class WorkerFailed(RuntimeError):
@@ -127,6 +130,14 @@ def judge(submission: intake.Submission, release: Released, timeout: float = 60.
             Finding(exercise.name, "error", 0.0, exercise.points, message=submission.problem) for exercise in release.exercises
         ]
         status = "student_error"
+    elif other := other_chapter(submission.notebook, release):
+        flags.append(f"other_chapter: {other}")
+        message = (
+            f"This is chapter {other.removeprefix('ch')}'s notebook ({other}), handed in as {release.assignment}; "
+            f"it holds none of the exercises of {release.assignment}."
+        )
+        findings = [Finding(one.name, "not_implemented", 0.0, one.points, message=message) for one in release.exercises]
+        status = "needs_review"
     else:
         tampered = tampering(submission.notebook, release)
         flags += tampered
@@ -138,7 +149,8 @@ def judge(submission: intake.Submission, release: Released, timeout: float = 60.
                 found[artefact.name], receipts = flights.judge(artefact, submission.folder, timeout)
                 flags = receipts + flags  # first, as the list of flags is cut at its end
         findings = [found[exercise.name] for exercise in release.exercises]
-        status = "needs_review" if tampered else "graded"
+        uncompared = any(flag.startswith(NOT_COMPARED) for flag in run.flags)
+        status = "needs_review" if tampered or uncompared else "graded"
     items = [Item(f.exercise, f.score, f.max_score, f.state, tuple(f.misconceptions), clean_text(f.message)) for f in findings]
     items += [Item(name, 0.0, points, "manual") for name, points in release.open_questions]
     return Verdict.of(
@@ -173,6 +185,25 @@ def tampering(notebook: Any, release: Released) -> list[str]:
     return missing + twice
 
 
+def other_chapter(notebook: Any, release: Released) -> str:
+    """The assignment whose notebook this is, if it holds cells of that one and neither cells nor answers of `release`; else ""."""
+    found = set(intake.grade_ids(notebook))
+    cells = [(number, cell.source) for number, cell in enumerate(notebook.cells) if cell.cell_type == "code"]
+    if not found or found & release.grade_ids or any(_last_definition(one.name, cells) >= 0 for one in release.exercises):
+        return ""
+    likeness = {name: len(found & ids) for name, ids in _graded_names().items()}
+    return max((name for name in likeness if likeness[name]), key=lambda name: likeness[name], default="")
+
+
+@functools.cache
+def _graded_names() -> dict[str, frozenset[str]]:
+    """Assignment → the ids of the cells that answer its exercises and open questions."""
+    return {
+        page.assignment: frozenset(str(cell.exercise or cell.open_question) for cell in (*page.exercises, *page.open_questions))
+        for page in chapter.all_chapters()
+    }
+
+
 def runnable(notebook: Any, release: Released) -> list[tuple[int, str]]:
     """The (number, source) of the code cells that are the learner's to run: not the checks, and nothing that the release marks live."""
     cells = []
@@ -194,58 +225,54 @@ def _squeezed(source: str) -> str:
     return "".join(source.split())
 
 
-@dataclass
 class _Run:
     """One submission's way through as many sandboxes as it takes: a fresh one whenever the last was lost."""
 
-    submission: intake.Submission
-    release: Released
-    timeout: float
-    trusted: bool
-    flags: list[str] = field(default_factory=list)
+    def __init__(self, submission: intake.Submission, release: Released, timeout: float, trusted: bool) -> None:
+        self.flags: list[str] = []
+        self._submission, self._timeout, self._trusted = submission, timeout, trusted
+        self._exercises = {one.name: one for one in release.exercises if isinstance(one, FrozenExercise)}
+        self._cells = runnable(submission.notebook, release)
+        self._defined = {name: _last_definition(name, self._cells) for name in self._exercises}
+        self._past = Past()
+        self._found: dict[str, Finding] = {}
+        self._stopped: dict[str, str] = {}  # number of a cell → what it raised
+        self._troubles: dict[int, str] = {}  # position of a lost cell → how it was lost
+        self._deadline = time.monotonic() + (len(self._exercises) + 1) * timeout + SLACK_SECONDS
 
     def findings(self) -> dict[str, Finding]:
         """What was found for every exercise that is judged by calling it, by name."""
-        exercises = [exercise for exercise in self.release.exercises if isinstance(exercise, FrozenExercise)]
-        self._cells = runnable(self.submission.notebook, self.release)
-        self._loading_failures: dict[str, str] = {}
-        self._reserved = 0
-        self._apart = False  # each exercise in a sandbox of its own, with the cells up to its definition and none after it
-        self._deadline = time.monotonic() + (len(exercises) + 1) * self.timeout + SLACK_SECONDS
-        found: dict[str, Finding] = {}
-        pending = list(exercises)
-        while pending and time.monotonic() < self._deadline:
+        while (attempt := plan(self._defined, len(self._cells), self._past)) and self._left() > 0:
+            if not (attempt.whole or attempt.definitions):
+                break
             with self._sandbox() as sandbox:
                 self._wait_until_ready(sandbox)
-                if not self._load(sandbox, pending):
-                    continue
-                while pending:
-                    exercise = pending.pop(0)
-                    try:
-                        found[exercise.name] = self._ask(sandbox, exercise)
-                    except SandboxTimeout:
-                        found[exercise.name] = self._timed_out(exercise)
-                        break
-                    except (SandboxError, ValueError) as error:
-                        if isinstance(error, SandboxDied) and self._may_be_a_later_cells_doing(exercise):
-                            self._apart = True
-                            pending.insert(0, exercise)
-                            break
-                        found[exercise.name] = _failed(exercise, "error", f"The call ended the process: {error}.")
-                        break
-                    if self._apart:
-                        break
-        return {exercise.name: found.get(exercise.name) or self._timed_out(exercise) for exercise in exercises}
+                if self._left() > 0 and self._load(sandbox, attempt):
+                    self._ask_all(sandbox, attempt)
+        return {name: self._found.get(name) or self._never_asked(exercise) for name, exercise in self._exercises.items()}
 
     @contextmanager
     def _sandbox(self) -> Iterator[Sandbox]:
         with ExitStack() as stack:
+            yield self._started(stack)
+
+    def _started(self, stack: ExitStack) -> Sandbox:
+        """A sandbox; without the submission's files if they are not what intake has seen, or if twice none starts with them."""
+        for last in (False, True) if self._submission.files else ():
             try:
-                sandbox = stack.enter_context(Sandbox(WORKER, [COURSE_LIB], self.submission.files, trusted=self.trusted))
-            except ValueError as error:  # files that changed after intake had looked at them
-                self.flags.append(f"ignored_files: {error}")
-                sandbox = stack.enter_context(Sandbox(WORKER, [COURSE_LIB], trusted=self.trusted))
-            yield sandbox
+                return stack.enter_context(Sandbox(WORKER, [COURSE_LIB], self._submission.files, trusted=self._trusted))
+            except (ValueError, SandboxUnavailable) as error:
+                if last or isinstance(error, ValueError):
+                    problem = error
+                    break
+        sandbox = stack.enter_context(Sandbox(WORKER, [COURSE_LIB], trusted=self._trusted))
+        if self._submission.files:
+            self._flag(f"ignored_files: {problem}")
+        return sandbox
+
+    def _flag(self, text: str) -> None:
+        if text not in self.flags:
+            self.flags.append(text)
 
     @staticmethod
     def _wait_until_ready(sandbox: Sandbox) -> None:
@@ -255,81 +282,108 @@ class _Run:
         except (SandboxTimeout, SandboxDied, SandboxGarbage, ValueError) as error:
             raise WorkerFailed(f"the worker did not start: {error}") from error
 
-    def _may_be_a_later_cells_doing(self, exercise: FrozenExercise) -> bool:
-        """Whether a process that was lost in a call may be lost to what a cell after the definition left running in it."""
-        return not self._apart and 0 <= _last_definition(exercise.name, self._cells) < len(self._cells) - 1
+    def _left(self) -> float:
+        return self._deadline - time.monotonic()
 
-    def _cells_for(self, exercise: FrozenExercise) -> list[tuple[int, str]]:
-        defined = _last_definition(exercise.name, self._cells)
-        return self._cells[: defined + 1] if self._apart and defined >= 0 else self._cells
+    def _happened(self, **changes: Any) -> None:
+        self._past = replace(self._past, **changes)
 
-    def _load(self, sandbox: Sandbox, pending: list[FrozenExercise]) -> bool:
-        """Run the learner's cells. If one hangs or ends the process, drop it, so that the next attempt goes round it."""
-        running = None
-        until = time.monotonic() + self._loading_time(pending)
+    # ------------------------------------------------------------------ running the cells
+
+    def _load(self, sandbox: Sandbox, attempt: Attempt) -> bool:
+        """Run the learner's cells. If one hangs or ends the process, it is lost, and the next attempt goes round it."""
+        positions = sorted((*attempt.whole, *attempt.definitions))
+        running = positions[0]
+        numbers = {self._cells[position][0]: position for position in positions}
+        until = time.monotonic() + share(self._left(), attempt.loading_spares, self._timeout)
         try:
-            sandbox.send(encode({"cells": self._cells_for(pending[0])}), self._left(until))
+            cells = [[*self._cells[position], position in attempt.whole] for position in positions]
+            sandbox.send(encode({"cells": cells}), max(until - time.monotonic(), 0.01))
             while time.monotonic() < until:
-                told = _told(sandbox, self._left(until))
+                told = _told(sandbox, max(until - time.monotonic(), 0.01))
                 if "loaded" in told:
-                    self._loading_failures = {str(number): str(text) for number, text in _mapping(told["loaded"]).items()}
+                    self._stopped = {str(number): str(text) for number, text in _mapping(told["loaded"]).items()}
                     return True
-                running = _number(told)
+                running = numbers.get(_number(told), running)
             raise SandboxTimeout("the cells are not done in time")
         except (SandboxError, ValueError) as error:
-            self._drop(running, error, pending)
+            trouble = "did_not_finish" if isinstance(error, SandboxTimeout) else "ended_the_process"
+            self._troubles[running] = trouble
+            self._flag(f"cell_{self._cells[running][0]}_{trouble}")
+            self._happened(lost=(*self._past.lost, running))
             return False
 
-    def _loading_time(self, pending: list[FrozenExercise]) -> float:
-        """`timeout`, but a further attempt must leave their own time to the exercises that were complete before the trouble."""
-        return min(self.timeout, self._deadline - time.monotonic() - self.timeout * self._reserved)
+    # ------------------------------------------------------------------ asking for the exercises
 
-    def _drop(self, running: int | None, error: Exception, pending: list[FrozenExercise]) -> None:
-        if not self._cells:
-            if isinstance(error, SandboxTimeout) and time.monotonic() >= self._deadline:
-                return  # all of the submission's time is spent: that is its own doing
-            raise WorkerFailed(f"the worker failed with nothing to run: {error}") from error
-        numbers = [number for number, _ in self._cells]
-        position = numbers.index(running) if running in numbers else len(numbers) - 1
-        trouble = "did_not_finish" if isinstance(error, SandboxTimeout) else "ended_the_process"
-        self.flags.append(f"cell_{numbers[position]}_{trouble}")
-        later = [exercise for exercise in pending if _last_definition(exercise.name, self._cells) > position]
-        earlier = [exercise for exercise in pending if exercise not in later]
-        pending[:] = earlier + later  # what was complete before the trouble is judged first
-        self._reserved = len(earlier)
-        if self._loading_time(pending) < 1 or not later:
-            del self._cells[position:]
-        else:
-            del self._cells[position]
+    def _ask_all(self, sandbox: Sandbox, attempt: Attempt) -> None:
+        """Ask for the exercises of an attempt, until the sandbox is lost to one of them."""
+        for later, name in zip(range(len(attempt.exercises) - 1, -1, -1), attempt.exercises, strict=True):
+            exercise, lost = self._exercises[name], True
+            try:
+                finding = self._ask(sandbox, exercise, share(self._left(), later + attempt.spares, self._timeout))
+                lost = False
+            except SandboxTimeout:
+                finding = self._timed_out(exercise)
+            except (SandboxError, ValueError) as error:
+                suspected = suspect(self._defined, len(self._cells), self._past, attempt, name)
+                if isinstance(error, SandboxDied) and suspected:
+                    self._past = suspected
+                    return
+                finding = _failed(exercise, "error", f"The call ended the process: {error}.")
+            self._found[name] = finding
+            if finding.state == "error" and not attempt.complete:
+                self._happened(tried=self._past.tried | {name})
+            else:
+                self._happened(found=self._past.found | {name})
+            if lost or self._left() <= 0:
+                return
 
-    def _ask(self, sandbox: Sandbox, exercise: FrozenExercise) -> Finding:
-        seconds = min(self.timeout, max(self._deadline - time.monotonic(), 0.1))
+    def _ask(self, sandbox: Sandbox, exercise: FrozenExercise, seconds: float) -> Finding:
         cases = [case.call for case in exercise.cases]
+        seconds = max(seconds, 0.1)
         sandbox.send(encode({"exercise": exercise.name, "seconds": seconds, "cases": cases}), GRACE_SECONDS)
-        patience = min(seconds + GRACE_SECONDS, max(self._deadline - time.monotonic(), 0.1) + 1)
-        told = _told(sandbox, patience)
+        told = _told(sandbox, min(seconds + GRACE_SECONDS, max(self._left(), 0.1) + 1))
         if "observations" in told:
-            seen = _observations(told["observations"], exercise)
-            return diagnose(exercise, [view(case, one) for case, one in zip(exercise.cases, seen, strict=True)])
+            return self._compared(exercise, _observations(told["observations"], exercise))
         if told.get("missing"):
             return self._missing(exercise)
         if told.get("ended") == "timeout":
             return self._timed_out(exercise)
         return _failed(exercise, "error", "The call ended its process.")
 
+    def _compared(self, exercise: FrozenExercise, seen: list[Observation]) -> Finding:
+        try:
+            return diagnose(exercise, [view(case, one) for case, one in zip(exercise.cases, seen, strict=True)])
+        except Exception as error:  # no answer, however odd, may end the grading; a person must look at this one
+            self._flag(f"{NOT_COMPARED}: {exercise.name} ({type(error).__name__})")
+            return _failed(exercise, "error", "The answer could not be compared with the right one; a person will look at it.")
+
+    # ------------------------------------------------------------------ what to say where there is no answer
+
     def _missing(self, exercise: FrozenExercise) -> Finding:
-        where = _last_definition(exercise.name, self._cells)
+        where = self._defined[exercise.name]
+        if where in self._troubles:
+            return self._lost_with_its_cell(exercise)
         number = str(self._cells[where][0]) if where >= 0 else ""
-        if number in self._loading_failures:
-            return _failed(exercise, "error", f"Code cell {number}, which defines it, stops: {self._loading_failures[number]}")
+        if number in self._stopped:
+            return _failed(exercise, "error", f"Code cell {number}, which defines it, stops: {self._stopped[number]}")
         return _failed(exercise, "not_implemented", f"The notebook defines no function {exercise.name}.")
 
-    def _timed_out(self, exercise: FrozenExercise) -> Finding:
-        return _failed(exercise, "timeout", f"No answer within {self.timeout:g} s.")
+    def _lost_with_its_cell(self, exercise: FrozenExercise) -> Finding:
+        where = self._defined[exercise.name]
+        state, ends = ENDINGS[self._troubles[where]]
+        return _failed(exercise, state, f"Code cell {self._cells[where][0]}, which defines it, {ends}.")
 
-    @staticmethod
-    def _left(until: float) -> float:
-        return max(until - time.monotonic(), 0.01)
+    def _never_asked(self, exercise: FrozenExercise) -> Finding:
+        if self._defined[exercise.name] in self._troubles or self._left() > 0:  # else no cell was left that could define it
+            return self._missing(exercise)
+        return self._timed_out(exercise)
+
+    def _timed_out(self, exercise: FrozenExercise) -> Finding:
+        message = f"No answer within {self._timeout:g} s."
+        for position, trouble in self._troubles.items():
+            message += f" Code cell {self._cells[position][0]} {ENDINGS[trouble][1]}."
+        return _failed(exercise, "timeout", message)
 
 
 def _failed(exercise: FrozenExercise, state: str, message: str) -> Finding:
@@ -339,7 +393,9 @@ def _failed(exercise: FrozenExercise, state: str, message: str) -> Finding:
 def _last_definition(name: str, cells: Sequence[tuple[int, str]]) -> int:
     """The position of the last cell that defines `name`, as text (a hostile cell is not worth parsing); -1 if none does."""
     # [ \t], for \s would run on over empty lines, from every one of them: a cell of nothing else would take for ever
-    pattern = re.compile(rf"^[ \t]*(?:(?:async\s+)?def\s+{name}\s*\(|class\s+{name}\b|{name}\s*(?::[^=\n]*)?=[^=])", re.MULTILINE)
+    defines = rf"(?:async\s+)?def\s+{name}\s*\(|class\s+{name}\b|{name}\s*(?::[^=\n]*)?=[^=]"
+    defines += rf"|(?:from[ \t]+\S+[ \t]+)?import[ \t][^\n]*\b{name}\b"
+    pattern = re.compile(rf"^[ \t]*(?:>>>[ \t]*|In \[\d+\]: )?(?:{defines})", re.MULTILINE)
     return max((position for position, (_, source) in enumerate(cells) if pattern.search(source)), default=-1)
 
 

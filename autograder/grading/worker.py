@@ -6,7 +6,7 @@ reads answers as plain arrays and compares them in its own process.
 The conversation, in frames of course_lib.checks.cases.encode, over the stream socket whose number is sys.argv[1]:
 
     worker  {"ready": true}
-    judge   {"cells": [[number, source], …]}
+    judge   {"cells": [[number, source, whether all of it or only what it defines], …]}
     worker  {"running": number} before each cell, then {"loaded": {number: error text}}
     judge   {"exercise": name, "seconds": s, "cases": [arguments of observe, …]}
     worker  {"observations": […]} | {"missing": true} | {"ended": "timeout" or "exit"}
@@ -30,7 +30,7 @@ gc.disable()  # while hundreds of modules are made, there is nothing to collect;
 import torch  # noqa: E402
 
 from course_lib.checks.cases import decode, encode  # noqa: E402
-from course_lib.checks.notebook import new_namespace, run_cell  # noqa: E402
+from course_lib.checks.notebook import new_namespace, run_cell, run_definitions  # noqa: E402
 from course_lib.checks.observing import observe, text_of  # noqa: E402
 
 gc.enable()
@@ -66,10 +66,10 @@ def load(channel: Channel, cells: list) -> dict:
     """Run the cells in order in one namespace; tell the judge before each, so that it knows which one hung or ended the process."""
     namespace = new_namespace()
     failures = {}
-    for number, source in cells:
+    for number, source, whole in cells:
         channel.send({"running": number})
         try:
-            run_cell(source, namespace, f"cell {number}")
+            (run_cell if whole else run_definitions)(source, namespace, f"cell {number}")
         except BaseException as error:  # whatever a cell raises, the next one runs
             failures[number] = f"{type(error).__name__}: {text_of(error)}"
     channel.send({"loaded": failures})

@@ -30,6 +30,7 @@ def main(arguments: list[str]) -> int:
         print(f"{path}: no cell of this notebook checks an exercise of the course", file=sys.stderr)
         return 2
     os.chdir(path.resolve().parent)  # files beside the notebook are found as Jupyter finds them
+    sys.path.append(os.getcwd())  # and modules, which shadow nothing, as in the grader
     os.environ.setdefault("MPLBACKEND", "Agg")
     namespace = new_namespace()
     failures = run_cells(cells, namespace)

@@ -1,21 +1,20 @@
 """Read a notebook file and run code cells in a plain namespace, without a kernel.
 
-The learner's command line check and the grader's sandbox use the same rules: IPython's magics are dropped, and after an exception the
-next cell goes on.
+The learner's command line check and the grader's sandbox use the same rules: a cell means what it means in IPython, without its side
+effects (course_lib.checks.magics says which), and after an exception the next cell goes on.
 """
 
 from __future__ import annotations
 
 import builtins
 import json
-import re
 import sys
 import types
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-MAGIC = re.compile(r"^\s*(%|!|\?|.*\?\s*$)")
+from course_lib.checks import magics
 
 
 class NotebookError(ValueError):
@@ -50,32 +49,23 @@ def is_check(cell: dict[str, Any]) -> bool:
 
 
 def new_namespace() -> dict[str, Any]:
-    """A `__main__` to run cells in, where `display` and `get_ipython` exist and do nothing."""
+    """A `__main__` to run cells in, where `display` does nothing and `get_ipython()` is a shell that does no harm."""
     module = types.ModuleType("__main__")
     sys.modules["__main__"] = module
     module.__dict__["__builtins__"] = builtins
     module.__dict__["display"] = lambda *_args, **_kwargs: None
-    module.__dict__["get_ipython"] = lambda: None
+    magics.install(module.__dict__)
     return module.__dict__
 
 
 def run_cell(source: str, namespace: dict[str, Any], name: str = "cell") -> None:
-    """Execute one cell's source. Whatever it raises comes through."""
-    try:
-        code = compile(source, f"<{name}>", "exec")
-    except SyntaxError:
-        code = compile(without_magics(source), f"<{name}>", "exec")
-    exec(code, namespace)
+    """Execute one cell's source as IPython would. Whatever it raises comes through."""
+    magics.shell_of(namespace).run(source, f"<{name}>")
 
 
-def without_magics(source: str) -> str:
-    """The source without IPython's lines: `%magic`, `!command`, `help?`; a cell that is another language's altogether is empty."""
-    lines = source.splitlines()
-    if lines and lines[0].startswith("%%"):
-        if lines[0].split()[0] not in ("%%time", "%%timeit", "%%capture"):
-            return ""
-        lines = lines[1:]
-    return "\n".join(re.sub(r"\S.*", "pass", line) if MAGIC.match(line) else line for line in lines)
+def run_definitions(source: str, namespace: dict[str, Any], name: str = "cell") -> None:
+    """Execute, of a cell that never ends, what defines something and calls nothing."""
+    magics.shell_of(namespace).run_definitions(source, f"<{name}>")
 
 
 def run_cells(cells: Sequence[dict[str, Any]], namespace: dict[str, Any]) -> dict[int, Exception]:

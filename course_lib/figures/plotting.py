@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import matplotlib.pyplot as plt
 from cycler import cycler
-from IPython import get_ipython
+from IPython.core.interactiveshell import InteractiveShell
 
 from course_lib.figures.statistics import summarise
 
@@ -46,7 +46,7 @@ def use_style():
             "svg.hashsalt": "course",
         }
     )
-    if get_ipython() is not None:
+    if InteractiveShell.initialized():
         from matplotlib_inline.backend_inline import set_matplotlib_formats
 
         set_matplotlib_formats("svg")

@@ -1,10 +1,10 @@
-"""Cells run without a kernel: magics are dropped, failures are kept, live and check cells are left alone."""
+"""Cells run without a kernel: failures are kept, live and check cells are left alone."""
 
 import json
 
 import pytest
 
-from course_lib.checks.notebook import NotebookError, code_cells, new_namespace, run_cell, run_cells, without_magics
+from course_lib.checks.notebook import NotebookError, code_cells, new_namespace, run_cell, run_cells
 
 
 def cell(source, **metadata):
@@ -30,27 +30,6 @@ def test_live_and_check_cells_do_not_run():
     check_cell = cell("ran = 'check'", nbgrader={"grade": True, "solution": False})
     assert run_cells([cell("ran = 'live'", tags=["live"]), check_cell], namespace) == {}
     assert "ran" not in namespace
-
-
-@pytest.mark.parametrize(
-    "source",
-    [
-        "%matplotlib inline\na = 1",
-        "!pip install torch\na = 1",
-        "a = 1\na?",
-        "%%time\na = 1",
-        "?print\na = 1",
-        "%load_ext x\nif 1:\n    %time b\n    a = 1",
-    ],
-)
-def test_magics_are_dropped(source):
-    namespace = new_namespace()
-    run_cell(source, namespace)
-    assert namespace["a"] == 1
-
-
-def test_a_cell_of_another_language_is_empty():
-    assert without_magics("%%bash\nrm -rf /") == ""
 
 
 def test_a_percent_sign_in_code_is_no_magic():
