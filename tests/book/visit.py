@@ -1,11 +1,15 @@
-"""Which pages there are, and a visit to one of them in a browser without a network."""
+"""Which pages there are, a visit to one of them in a browser without a network, and what a visit sees."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
-from autograder.authoring.chapter import all_chapters
-from autograder.publishing.book import HOW_TO, docname
+from autograder.book import HOW_TO, docname
+from autograder.chapter import all_chapters
+from tests.book import axe
+
+SCREENSHOTS = Path(__file__).resolve().parents[2] / "test-artefacts"
 
 LOOKS = {  # colour scheme, width in CSS pixels
     "light": ("light", 1280),
@@ -19,7 +23,7 @@ CHAPTERS = [page for page in PAGES if page.startswith("chapters/")]
 class Visit:
     """A page opened from disk, with what it asked for elsewhere and what it complained of."""
 
-    def __init__(self, browser, path: Path, look: str = "light"):
+    def __init__(self, browser, path: Path, look: str = "light", query: str = ""):
         scheme, width = LOOKS[look]
         self.context = browser.new_context(
             color_scheme=scheme, viewport={"width": width, "height": 900}, has_touch=look == "phone", offline=True
@@ -32,7 +36,7 @@ class Visit:
         self.page.on("requestfailed", lambda request: self.complaints.append(f"failed: {request.url}"))
         self.page.on("console", lambda message: message.type == "error" and self.complaints.append(message.text))
         self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
-        self.page.goto(path.as_uri())
+        self.page.goto(path.as_uri() + query)
         self.page.wait_for_function("!window.MathJax || (MathJax.startup.promise && MathJax.startup.promise.then(() => true))")
 
     def __enter__(self):
@@ -40,3 +44,84 @@ class Visit:
 
     def __exit__(self, *error):
         self.context.close()
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A page in one look, written down in one visit; lists name places."""
+
+    requests: list[str]
+    complaints: list[str]
+    width: int  # of all that is on it, in CSS pixels
+    equations_on_lines_of_their_own: int
+    equations_that_begin_beyond_the_edge: list[str]
+    equations_wider_than_their_column: list[str]
+    equations_with_errors: list[str]
+    equations_not_rendered: list[str]
+    downloads: list[str]  # where the links to notebooks lead
+    references: list[tuple[str, bool]]  # the folds with reference solutions: text, open?
+    paper: dict | None  # what the page shows in print; of chapters, in the dark
+    violations: list[str]  # of axe's rules, serious or critical, with every fold open and every quiz answered
+
+
+EQUATIONS = """() => {
+  const all = (what) => [...document.querySelectorAll(what)];
+  const name = (node) => node.closest("div.math[id]")?.id || node.innerText || node.outerHTML.slice(0, 120);
+  const blocks = all("div.math");
+  return {
+    equations_on_lines_of_their_own: all("div.math mjx-container").length,
+    equations_that_begin_beyond_the_edge:
+      all("div.math mjx-container").filter((one) => one.getBoundingClientRect().left < 0).map(name),
+    equations_wider_than_their_column: blocks.filter((one) => one.scrollWidth > one.clientWidth).map(name),
+    equations_with_errors: all("mjx-merror").map((one) => one.textContent),
+    equations_not_rendered: all("span.math:not(:has(mjx-container)), div.math:not(:has(mjx-container))").map(name),
+  };
+}"""
+WIDTH = "document.documentElement.scrollWidth"
+OPEN = "document.querySelectorAll('details').forEach(fold => { fold.open = true; })"
+
+
+def look_at(browser, html: Path, name: str, look: str) -> Seen:
+    """All that is to be seen on a page without touching it, and then, with every fold open and every quiz answered, by axe."""
+    SCREENSHOTS.mkdir(exist_ok=True)
+    with Visit(browser, html / f"{name}.html", look) as visit:
+        page, picture = visit.page, SCREENSHOTS / f"{Path(name).name}-{look}.png"
+        page.wait_for_timeout(200)  # whatever scripts load late
+        page.screenshot(path=picture, full_page=True)
+        width = page.evaluate(WIDTH)
+        equations = page.evaluate(EQUATIONS)
+        downloads = page.locator("article a[href$='.ipynb']").evaluate_all("all => all.map(one => one.getAttribute('href'))")
+        folds = page.locator("details", has_text="Reference solution")
+        references = folds.evaluate_all("all => all.map(one => [one.textContent, one.open])")
+        paper = _on_paper(page, name) if look == "dark" and name in CHAPTERS else None
+        requests, complaints = list(visit.requests), list(visit.complaints)  # before axe reads style sheets
+        violations = []
+        if look != "phone":
+            page.evaluate(OPEN)
+            for answer in page.locator("div.quiz label:last-of-type input").all():
+                answer.check()
+            violations = axe.grave(axe.violations(page))
+    return Seen(
+        requests, complaints, width, **equations, downloads=downloads, references=references, paper=paper, violations=violations
+    )
+
+
+def _on_paper(page, name: str) -> dict:
+    """The page in print, as its reader has left it; the screen is as before afterwards."""
+    page.emulate_media(media="print")
+    page.pdf(path=SCREENSHOTS / f"{Path(name).name}.pdf", format="A4")
+    before = page.viewport_size
+    page.set_viewport_size({"width": 720, "height": 1000})  # about what A4 leaves between its margins
+    page.screenshot(path=SCREENSHOTS / f"{Path(name).name}-print.png", full_page=True)
+    gone = (".bd-sidebar-primary", ".bd-sidebar-secondary", ".bd-header-article", ".prev-next-footer")
+    background = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    paper = {
+        "pixels beyond its edge": max(0, page.evaluate(WIDTH) - 720),
+        "shown": [part for part in gone if page.locator(part).first.is_visible()],
+        "background": background.replace("rgba(0, 0, 0, 0)", "rgb(255, 255, 255)"),  # what is not painted stays white
+        "open folds": page.locator("article details[open] > summary").all_text_contents(),
+    }
+    page.set_viewport_size(before)
+    page.emulate_media(media="screen")
+    page.wait_for_function("document.documentElement.dataset.theme === 'dark'")
+    return paper
