@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from unittest.mock import patch
 
 import pytest
@@ -12,27 +13,71 @@ from course_lib.chapters import REFERENCES
 from tests.book.visit import CHAPTERS, Visit
 
 
-@pytest.mark.parametrize("chapter", all_chapters(), ids=lambda chapter: chapter.assignment)
-def test_sliders_moved_by_keyboard_show_the_librarys_own_values(browser, html, chapter, monkeypatch):
-    monkeypatch.setenv(REFERENCES, "solutions")  # for functions that a chapter takes over from an earlier one
+@pytest.fixture(scope="module", params=all_chapters(), ids=lambda chapter: chapter.assignment)
+def chapter(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def page(browser, html, chapter):
+    """The chapter's page, opened once for all that answers to the keyboard: a fold, a quiz and a slider do not touch one another."""
     with Visit(browser, html / f"{docname(chapter)}.html") as visit:
-        figures = visit.page.locator("figure.explorer").all()
-        assert figures
-        for figure, (series, choices) in zip(figures, _explorers(chapter), strict=True):
-            sliders = figure.get_by_role("slider").all()
-            for slider in sliders:
-                pictures = set()
-                slider.focus()
-                for key in ("Home", "ArrowRight", "End"):
-                    visit.page.keyboard.press(key)
-                    pictures.add(figure.evaluate("node => [...node.querySelectorAll('svg')].map(svg => svg.innerHTML).join()"))
-                    positions = [int(one.input_value()) for one in sliders]
-                    setting = {name: values[at] for (name, values), at in zip(choices.items(), positions, strict=True)}
-                    assert figure.locator("output").all_text_contents() == [
-                        value if isinstance(value, str) else f"{value:g}" for value in setting.values()
-                    ]
-                    assert _shown(figure) == _computed(series(**setting)), setting
-                assert len(pictures) > 1
+        yield visit.page
+
+
+def test_a_fold_opens_by_keyboard(page):
+    fold = page.locator("article details", has_text="Hint 1").first
+    body = fold.locator("p").last
+    assert not body.is_visible()
+    fold.locator("summary").focus()
+    page.keyboard.press("Enter")
+    assert body.is_visible()
+
+
+def test_quizzes_explain_every_answer_by_keyboard(page, chapter):
+    quizzes = page.locator("div.quiz").all()
+    assert len(quizzes) == chapter.path.read_text(encoding="utf-8").count(":::{quiz}") > 0
+    for quiz in quizzes:
+        form, verdict = quiz.get_by_role("group"), quiz.get_by_role("status")
+        assert form.evaluate("node => node.querySelector('legend').textContent.trim()")
+        assert verdict.text_content() == "" and quiz.locator("details").count() == 0
+        answers, heard = form.get_by_role("radio").all(), []
+        answers[0].focus()
+        for answer, key in zip(answers, ["Space", *["ArrowDown"] * len(answers)], strict=False):
+            page.keyboard.press(key)
+            assert answer.is_checked() and verdict.is_visible()
+            heard.append(verdict.inner_text())
+        assert len(set(heard)) == len(answers)
+        assert sorted(text.split()[0] for text in heard) == ["Right."] + ["Wrong."] * (len(answers) - 1)
+
+
+def test_sliders_moved_by_keyboard_show_the_librarys_own_values(page, chapter, monkeypatch):
+    monkeypatch.setenv(REFERENCES, "solutions")  # for functions that a chapter takes over from an earlier one
+    figures = page.locator("figure.explorer").all()
+    assert figures
+    for figure, (series, choices) in zip(figures, _explorers(chapter), strict=True):
+        computed = functools.cache(lambda series=series, **setting: _computed(series(**setting)))
+        for slider in figure.get_by_role("slider").all():
+            pictures = set()
+            slider.focus()
+            for key in ("Home", "ArrowRight", "End"):
+                page.keyboard.press(key)
+                shown = figure.evaluate(SHOWN)
+                pictures.add(shown["picture"])
+                setting = {name: values[at] for (name, values), at in zip(choices.items(), shown["positions"], strict=True)}
+                assert shown["outputs"] == [value if isinstance(value, str) else f"{value:g}" for value in setting.values()]
+                table = {name: [float(value or "nan") for value in values] for name, *values in shown["rows"]}
+                assert table == computed(**setting), setting
+            assert len(pictures) > 1
+
+
+# What a figure shows: where its sliders stand, what is written beside them, its pictures, and its table, read while it is folded.
+SHOWN = """figure => ({
+  positions: [...figure.querySelectorAll("input[type=range]")].map((slider) => Number(slider.value)),
+  outputs: [...figure.querySelectorAll("output")].map((output) => output.textContent),
+  picture: [...figure.querySelectorAll("svg")].map((svg) => svg.innerHTML).join(),
+  rows: [...figure.querySelectorAll("tbody tr")].map((row) => [...row.cells].map((cell) => cell.textContent)),
+})"""
 
 
 def _explorers(chapter):
@@ -53,47 +98,9 @@ def _explorers(chapter):
     return given
 
 
-def _shown(figure):
-    """The figure's table, series by series, read while it is folded."""
-    rows = figure.evaluate(
-        "node => [...node.querySelectorAll('tbody tr')].map(row => [...row.cells].map(cell => cell.textContent))"
-    )
-    return {name: [float(value or "nan") for value in values] for name, *values in rows}
-
-
 def _computed(series):
     """What the table must hold: three significant digits are shown."""
     return {name: pytest.approx(list(map(float, one.y)), rel=6e-3, abs=1e-6, nan_ok=True) for name, one in series.items()}
-
-
-@pytest.mark.parametrize("name", CHAPTERS)
-def test_a_fold_opens_by_keyboard(browser, html, name):
-    with Visit(browser, html / f"{name}.html") as visit:
-        fold = visit.page.locator("article details", has_text="Hint 1").first
-        body = fold.locator("p").last
-        assert not body.is_visible()
-        fold.locator("summary").focus()
-        visit.page.keyboard.press("Enter")
-        assert body.is_visible()
-
-
-@pytest.mark.parametrize("chapter", all_chapters(), ids=lambda chapter: chapter.assignment)
-def test_quizzes_explain_every_answer_by_keyboard(browser, html, chapter):
-    with Visit(browser, html / f"{docname(chapter)}.html") as visit:
-        quizzes = visit.page.locator("div.quiz").all()
-        assert len(quizzes) == chapter.path.read_text(encoding="utf-8").count(":::{quiz}") > 0
-        for quiz in quizzes:
-            form, verdict = quiz.get_by_role("group"), quiz.get_by_role("status")
-            assert form.evaluate("node => node.querySelector('legend').textContent.trim()")
-            assert verdict.text_content() == "" and quiz.locator("details").count() == 0
-            answers, heard = form.get_by_role("radio").all(), []
-            answers[0].focus()
-            for answer, key in zip(answers, ["Space", *["ArrowDown"] * len(answers)], strict=False):
-                visit.page.keyboard.press(key)
-                assert answer.is_checked() and verdict.is_visible()
-                heard.append(verdict.inner_text())
-            assert len(set(heard)) == len(answers)
-            assert sorted(text.split()[0] for text in heard) == ["Right."] + ["Wrong."] * (len(answers) - 1)
 
 
 @pytest.mark.parametrize("name", CHAPTERS)
