@@ -40,7 +40,7 @@ WRONG = {  # what is put into a page, and the rule that it breaks
         "article",
         '<p id="ID" style="background: linear-gradient(#fff, #000); color: #888">somewhere in it</p>',
     ),
-    "in a fold": ("color-contrast", "article details", '<p id="ID" style="background: #fff; color: #8a8a8a">faint</p>'),
+    "in a fold": ("color-contrast", "article details", '<p id="ID" style="background: #fff; color: #8b8b8b">faint</p>'),
     "an input without a label": ("label", "article", '<input id="ID" type="text">'),
     "an image without words": ("image-alt", "article", '<img id="ID" src="data:image/gif;base64,R0lGODlhAQABAAAAACw=">'),
     "a link without words": ("link-name", "article", '<a id="ID" href="#"></a>'),
