@@ -22,13 +22,14 @@ def seen(browser, html):
 @pytest.mark.parametrize("name", PAGES)
 def test_page_asks_for_nothing_from_elsewhere(seen, name, look):
     abroad = [url for url in seen(name, look).requests if not url.startswith(("file:", "data:", "blob:"))]
-    assert abroad == []
+    assert abroad == [], "\n" + "\n".join(abroad)
 
 
 @pytest.mark.parametrize("look", LOOKS)
 @pytest.mark.parametrize("name", PAGES)
 def test_page_loads_without_complaint(seen, name, look):
-    assert seen(name, look).complaints == []
+    complaints = seen(name, look).complaints
+    assert complaints == [], "\n" + "\n".join(complaints)
 
 
 @pytest.mark.parametrize("look", LOOKS)
@@ -41,7 +42,8 @@ def test_page_is_no_wider_than_its_window(seen, name, look):
 @pytest.mark.parametrize("look", ["light", "dark"])
 @pytest.mark.parametrize("name", PAGES)
 def test_axe_finds_no_serious_or_critical_violation(seen, name, look):
-    assert seen(name, look).violations == []
+    violations = seen(name, look).violations
+    assert violations == [], "\n" + "\n".join(violations)  # all of them: a comparison is shown in part
 
 
 @pytest.mark.parametrize("name", CHAPTERS)
@@ -58,7 +60,7 @@ def test_equations_are_rendered_and_begin_where_a_phone_can_show_them(seen, name
 @pytest.mark.parametrize("name", CHAPTERS)
 def test_no_equation_is_wider_than_its_column(seen, name):
     cut = seen(name, "light").equations_wider_than_their_column
-    assert cut == [], "break it into lines (aligned): its number is cut off"
+    assert cut == [], "break into lines (aligned), for the number is cut off:\n" + "\n".join(cut)
 
 
 @pytest.mark.parametrize("name", CHAPTERS)
