@@ -61,7 +61,7 @@ def test_each_kind_of_violation_is_found_where_it_is(browser, html, look):
         assert any(line.startswith(f"{rule}: ") and f"#wrong-{at}'" in line for line in found), f"{kind}: not among {found}"
 
 
-@pytest.mark.parametrize(("chapter", "look"), zip(LONGEST, ["light", "dark"], strict=True), ids=["light", "dark"])
+@pytest.mark.parametrize(("chapter", "look"), list(zip(LONGEST, ["light", "dark"], strict=True)), ids=["light", "dark"])
 def test_no_rule_and_no_pair_of_colours_is_lost_where_a_style_sheet_is_broken(browser, html, chapter, look):
     with Visit(browser, html / f"{docname(chapter)}.html", look) as visit:
         visit.page.evaluate(OPEN)
