@@ -63,6 +63,18 @@ def test_no_equation_is_wider_than_its_column(seen, name):
     assert cut == [], "break into lines (aligned), for the number is cut off:\n" + "\n".join(cut)
 
 
+@pytest.mark.parametrize("chapter", all_chapters(), ids=lambda chapter: chapter.assignment)
+def test_no_line_of_code_is_cut_off(seen, chapter):
+    source = [line.strip() for line in chapter.path.read_text(encoding="utf-8").splitlines()]
+    cut = [
+        f"{chapter.path.name}:{source.index(line.strip()) + 1 if line.strip() in source else '?'}: "
+        f"{len(line)} columns, of which {block['columns']} are to be seen: {line}"
+        for block in seen(docname(chapter), "light").code_cut_off
+        for line in block["lines"]
+    ]
+    assert cut == [], "\n" + "\n".join(cut)
+
+
 @pytest.mark.parametrize("name", CHAPTERS)
 def test_the_printed_page_is_the_article_as_the_reader_left_it(seen, name):
     wanted = {"pixels beyond its edge": 0, "shown": [], "background": "rgb(255, 255, 255)", "open folds": []}

@@ -58,6 +58,7 @@ class Seen:
     equations_wider_than_their_column: list[str]
     equations_with_errors: list[str]
     equations_not_rendered: list[str]
+    code_cut_off: list[dict]  # of input cells, folded or not, blocks that are wider than their column: {lines, columns that fit}
     downloads: list[str]  # where the links to notebooks lead
     references: list[tuple[str, bool]]  # the folds with reference solutions: text, open?
     paper: dict | None  # what the page shows in print; of chapters, in the dark
@@ -77,6 +78,16 @@ EQUATIONS = """() => {
     equations_not_rendered: all("span.math:not(:has(mjx-container)), div.math:not(:has(mjx-container))").map(name),
   };
 }"""
+CODE = """() => [...document.querySelectorAll("div.cell_input pre")].flatMap((pre) => {
+  if (pre.scrollWidth <= pre.clientWidth) return [];
+  const style = getComputedStyle(pre), lines = pre.textContent.split("\\n"), ruler = document.createElement("span");
+  ruler.textContent = "0".repeat(100);
+  const one = pre.appendChild(ruler).getBoundingClientRect().width / 100;
+  ruler.remove();
+  const columns = Math.floor((pre.clientWidth - parseFloat(style.paddingLeft) - parseFloat(style.paddingRight) + 0.01) / one);
+  const long = lines.filter((line) => line.length > columns), longest = Math.max(...lines.map((line) => line.length));
+  return [{lines: long.length ? long : lines.filter((line) => line.length === longest), columns}];
+})"""
 WIDTH = "document.documentElement.scrollWidth"
 OPEN = "document.querySelectorAll('details').forEach(fold => { fold.open = true; })"
 
@@ -95,14 +106,23 @@ def look_at(browser, html: Path, name: str, look: str) -> Seen:
         references = folds.evaluate_all("all => all.map(one => [one.textContent, one.open])")
         paper = _on_paper(page, name) if look == "dark" and name in CHAPTERS else None
         requests, complaints = list(visit.requests), list(visit.complaints)  # before axe reads style sheets
-        violations = []
+        violations, code_cut_off = [], []
         if look != "phone":
             page.evaluate(OPEN)
+            code_cut_off = page.evaluate(CODE)
             for answer in page.locator("div.quiz label:last-of-type input").all():
                 answer.check()
             violations = axe.grave(axe.violations(page))
     return Seen(
-        requests, complaints, width, **equations, downloads=downloads, references=references, paper=paper, violations=violations
+        requests,
+        complaints,
+        width,
+        **equations,
+        code_cut_off=code_cut_off,
+        downloads=downloads,
+        references=references,
+        paper=paper,
+        violations=violations,
     )
 
 
