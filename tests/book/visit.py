@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from autograder.book import HOW_TO, docname
-from autograder.chapter import all_chapters
+from autograder.authoring.chapter import all_chapters
+from autograder.publishing.book import HOW_TO, docname
 from tests.book import axe
 
 SCREENSHOTS = Path(__file__).resolve().parents[2] / "test-artefacts"
