@@ -207,6 +207,63 @@ def _state(name: str, folder: Path) -> str:
 
 
 @app.command()
+def prove(
+    only: Annotated[list[str] | None, typer.Option(help="Of this chapter only, as in --only ch44; may be repeated.")] = None,
+    exercise: Annotated[list[str] | None, typer.Option(help="This exercise, kept or not; may be repeated.")] = None,
+    every: Annotated[bool, typer.Option("--all", help="Also what has a fitting record.")] = False,
+    seeds: Annotated[
+        int | None, typer.Option(min=1, help="Seeds 0 to N - 1; other than the full 50, a table is printed and nothing written.")
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes at a time, one core each.")] = os.cpu_count() or 1,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler, tcp://…, instead of --jobs.")] = None,
+) -> None:
+    """Prove that the checks reject and name every misconception and accept every variant, and keep the record that the book prints.
+
+    Only what has no fitting record is proved. Exit status: 0 all proved, 1 something found, 2 bad input, 3 the machinery failed.
+    """
+    from autograder.proving import killmatrix
+    from autograder.proving import prove as prover
+
+    draws = range(seeds or killmatrix.SEEDS)
+    writes = len(draws) == killmatrix.SEEDS
+    try:
+        wanted = prover.targets(only or (), exercise or (), every or not writes)
+    except prover.UnknownName as error:
+        _stop(error)
+    if not wanted:
+        print("Nothing to prove: every record fits (--all proves anew)")
+        return
+    keeper = prover.Keeper(wanted) if writes else None
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    outcomes = []
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+        task = bar.add_task("proving", total=None)
+        try:
+            for outcome in prover.prove(
+                wanted, draws, jobs, scheduler,
+                lambda name, done, total: bar.update(task, description=name, completed=done, total=total),
+            ):  # fmt: skip
+                outcomes.append(outcome)
+                if keeper:
+                    keeper.keep(outcome)
+                    found = len(outcome.findings) + len(outcome.broken)
+                    state = f"{found} finding{'s' * (found > 1)}" if found else "proved"
+                    err.print(f"{outcome.target.assignment} {outcome.target.exercise}: {state}", markup=False)
+        except OSError as error:  # no scheduler there, or a full disk
+            bar.stop()
+            _stop(error, BROKEN)
+    if not writes:
+        outcomes.sort(key=lambda outcome: wanted.index(outcome.target))
+        print("\n".join(prover.table([outcome.rows for outcome in outcomes if outcome.rows])))
+    for line in [line for outcome in outcomes for line in outcome.findings + outcome.broken]:
+        print(line)
+    if any(outcome.broken for outcome in outcomes):
+        _stop("some exercises could not be proved: run again; what is proved is kept", BROKEN)
+    if any(outcome.findings for outcome in outcomes):
+        _stop("some checks do not tell wrong from right; nothing is kept of these exercises", 1)
+
+
+@app.command()
 def doctor() -> None:
     """Say what works on this machine, and how to mend what does not."""
     from autograder import doctor

@@ -108,7 +108,7 @@ class Artefact:
     thresholds: tuple[float, float]
     episodes: int = 100
     visible_episodes: int = 20
-    experiment: str = ""  # whose agents show that the thresholds are right: autograder.calibration
+    experiment: str = ""  # whose agents show that the thresholds are right: autograder.proving.calibration
     right: str = "ours"  # its variant that was trained rightly; those whose configuration names a `mistake` were not
     wrong: Sequence[str] = ()  # of these, the ones that a flight must show
 

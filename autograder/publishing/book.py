@@ -1,7 +1,7 @@
 """Build the book: execute, stage, render, publish.
 
 Contract of the four steps:
-  execute   every chapter's code runs once (autograder.publishing.execution keeps the outputs);
+  execute   every chapter's code runs once, the chapters side by side (autograder.publishing.execution keeps the outputs);
   stage     all that Sphinx reads is computed in memory and written to book/_stage, where files that did not change keep
             their time, so that Sphinx renders changed pages only;
   render    Jupyter Book runs under _config.yml with warnings as errors, in book/_cache, never in the published tree;
@@ -11,40 +11,34 @@ A book with and one without solutions are staged and rendered in folders of thei
 
 from __future__ import annotations
 
-import dataclasses
-import fcntl
 import fnmatch
 import importlib.util
 import json
-import multiprocessing
 import os
 import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import nbformat
 import yaml
 
 from autograder.authoring import assemble
 from autograder.authoring.chapter import Chapter, all_chapters
-from autograder.paths import COURSE_LIB, ROOT, RUNS
-from autograder.publishing.execution import BookError, cache_folder, code_inputs, content_hash, executed_outputs, replace_cached
+from autograder.paths import ROOT
+from autograder.proving.locks import one_at_a_time
+from autograder.publishing.execution import BookError, cache_folder, content_hash, executed_outputs, execution_key, run_all
+
+if TYPE_CHECKING:
+    from autograder.proving.kept import Keys
 
 BOOK = ROOT / "book"
 STAGE = BOOK / "_stage"
 PUBLISHED = ("*.html", "searchindex.js", "_static/*", "_images/*", "_downloads/*")
 HOW_TO = ("how-to/learners", "how-to/teachers", "how-to/contributors")
 MATHJAX = ("tex-chtml-full.js", "output/chtml/fonts/**/*", "a11y/*", "sre/**/*")
-# The library's modules that no kill matrix depends on: it takes minutes, so a new plot must not ask for it again.
-WITHOUT_A_SAY = (
-    "artefact", "chapters", "check", "checking", "command", "direct", "fine_tuning", "flight", "interactive", "judges", "lm", "notebook",
-    "plotting", "preferences", "records", "reward_models", "rlhf", "statistics", "variety", "videos",
-)  # fmt: skip
 
 __all__ = ["BookError", "build", "executed_outputs"]
 
@@ -57,7 +51,7 @@ def build(with_solutions: bool = True, out: Path | None = None) -> Path:
     Raises: BookError if a cell fails, or Sphinx warns.
     """
     out = Path(out or BOOK / "_build" / "html").resolve()
-    with _one_at_a_time("build"):
+    with one_at_a_time(cache_folder() / "build.lock"):
         chapters = all_chapters()
         key = _build_key(chapters, with_solutions)
         if _is_current(out, key):
@@ -65,6 +59,7 @@ def build(with_solutions: bool = True, out: Path | None = None) -> Path:
             return out
         for chapter in chapters:
             assemble.verify(chapter)  # first, so that a slip in the prose is not found after minutes of running code
+        run_all(chapters)
         variant = "solved" if with_solutions else "unsolved"
         stage, work = STAGE / variant, cache_folder() / f"sphinx-{variant}"
         if sync(staged_files(chapters, with_solutions), stage):
@@ -80,6 +75,8 @@ def build(with_solutions: bool = True, out: Path | None = None) -> Path:
 
 def staged_files(chapters: list[Chapter], with_solutions: bool) -> dict[str, bytes]:
     """Everything that Sphinx reads, by path relative to the staging folder."""
+    from autograder.proving import kept
+
     pages = [*BOOK.glob("*.md"), *BOOK.glob("how-to/*.md"), *BOOK.glob("*.bib")]
     files = {path.relative_to(BOOK).as_posix(): path.read_bytes() for path in pages}
     files["index.md"] = _front_page(files["index.md"].decode(), chapters).encode()
@@ -94,7 +91,10 @@ def staged_files(chapters: list[Chapter], with_solutions: bool) -> dict[str, byt
         ].source += f"\n- **Notebook:** {{download}}`{chapter.assignment}.ipynb <downloads/{chapter.assignment}.ipynb>`"
         files[f"{docname(chapter)}.ipynb"] = nbformat.writes(page).encode()
         files[f"chapters/downloads/{chapter.assignment}.ipynb"] = nbformat.writes(student).encode()
-    matrix = {f"{chapter.number}. {chapter.title}": kill_rows(chapter) for chapter in chapters}
+    keys = kept.Keys()
+    matrix = {
+        f"{chapter.number}. {chapter.title}": kill_rows(chapter, keys) for chapter in chapters
+    }  # recorded, never drawn here
     files["kill-matrix.md"] = kill_matrix_page(matrix).encode()
     return files | _assets()
 
@@ -139,11 +139,14 @@ def _plain(text: str) -> str:
 
 
 def kill_matrix_page(matrix: dict[str, list[dict]]) -> str:
-    """The appendix on how the checks were tested, from each chapter's heading and rows (autograder.killmatrix, as dicts)."""
+    """The appendix on how the checks were tested, from each chapter's heading and rows (`kill_rows`)."""
     lines = [(BOOK / "kill-matrix.md").read_text(encoding="utf-8").rstrip(), ""]
     for heading, rows in matrix.items():
         lines += [f"## {heading}", ""]
         for row in rows:
+            if "unproved" in row:
+                lines += [f"### `{row['exercise']}`", "", row["unproved"], ""]
+                continue
             if "agents" in row:
                 lines += _agents(row)
                 continue
@@ -186,53 +189,21 @@ def _must_fail(group: dict, row: dict) -> str:
     return "" if not group["mistake"] else "yes" if group["variant"] in row["wrong"] else "no"
 
 
-def kill_rows(chapter: Chapter) -> list[dict]:
-    """The chapter's kill matrix, a dict for each exercise, computed on all cores once for each state of what takes part."""
+def kill_rows(chapter: Chapter, keys: Keys | None = None) -> list[dict]:
+    """The chapter's part of the kill matrix, a dict for each exercise, from its kept record; where that does not fit, one that says so."""
     from autograder import checks  # loads torch, as does all that judges
+    from autograder.proving import kept
 
-    library = [path for path in COURSE_LIB.glob("*.py") if path.stem not in WITHOUT_A_SAY]
-    own = [path for path in code_inputs(chapter) if not {COURSE_LIB, RUNS} & set(path.parents)]
-    cached = (
-        cache_folder() / f"{chapter.assignment}-{content_hash([], [*library, *own, ROOT / 'autograder' / 'killmatrix.py'])}.json"
-    )
-    with _one_at_a_time("kill-matrix"):
-        if not cached.exists():
-            print(
-                f"{chapter.assignment}: testing its checks against wrong and right answers (minutes, the first time)", flush=True
-            )
-            names = [exercise.name for exercise in checks.functions(chapter.assignment)]
-            with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
-                rows = list(pool.map(_exercise_rows, [chapter.assignment] * len(names), names))
-            replace_cached(cached, json.dumps(rows))
-        return json.loads(cached.read_text(encoding="utf-8")) + _calibrations(chapter)
-
-
-def _calibrations(chapter: Chapter) -> list[dict]:
-    """The same for the exercises that are judged by a file: the agents on which their thresholds were tried."""
-    from autograder import calibration, checks
-    from autograder.authoring.spec import Artefact
-
-    return [
-        {
-            "exercise": artefact.name,
-            "thresholds": artefact.thresholds,
-            "episodes": artefact.episodes,
-            "wrong": list(artefact.wrong),
-            "agents": [dataclasses.asdict(row) for row in calibration.rows(artefact, calibration.groups(artefact))],
-        }
-        for artefact in checks.exercises(chapter.assignment)
-        if isinstance(artefact, Artefact)
-    ]
-
-
-def _exercise_rows(assignment: str, name: str) -> dict:
-    import torch  # here, because a build from the cache can do without
-
-    from autograder import checks, killmatrix
-
-    torch.set_num_threads(1)
-    exercise = next(exercise for exercise in checks.functions(assignment) if exercise.name == name)
-    return dataclasses.asdict(killmatrix.exercise_rows(exercise))
+    known, reasons = kept.load(chapter.assignment), kept.unproved(chapter.assignment, keys)
+    rows = []
+    for exercise in checks.exercises(chapter.assignment):
+        if exercise.name in reasons:
+            missing = f"{reasons[exercise.name]}; `{kept.remedy(chapter.assignment)}`"
+            print(f"{chapter.assignment}: {exercise.name}: {missing}", file=sys.stderr, flush=True)
+            rows.append({"exercise": exercise.name, "unproved": f"{missing[0].upper()}{missing[1:]}."})
+        else:
+            rows.append({"exercise": exercise.name} | known[exercise.name].rows)
+    return rows
 
 
 def _front_page(text: str, chapters: list[Chapter]) -> str:
@@ -308,11 +279,14 @@ def _publish(html: Path, out: Path) -> None:
 
 
 def _build_key(chapters: list[Chapter], with_solutions: bool) -> str:
-    """A hash of all inputs of a build: texts, code, this builder, the pins, the configuration."""
+    """A hash of all inputs of a build: texts, outputs, code, kept records, this builder, the pins, the configuration. The pages show
+    more of the code than their outputs rest on, and rendering them again is quick."""
     own = [path for path in BOOK.rglob("*") if path.is_file() and not path.relative_to(BOOK).parts[0].startswith("_")]
-    builder = [*(ROOT / "autograder").glob("*.py"), ROOT / "_config.yml"]
-    inputs = [path for chapter in chapters for path in [chapter.path, *code_inputs(chapter)]]
-    return content_hash([str(with_solutions)], [*own, *builder, *inputs])
+    code = [path for folder in ("autograder", "course_lib", "solutions") for path in (ROOT / folder).rglob("*.py")]
+    kept = [*(ROOT / "autograder" / "proving" / "records").glob("*.json"), ROOT / "requirements.txt", ROOT / "constraints.txt"]
+    chapters_own = [chapter.path for chapter in chapters]
+    outputs = [execution_key(chapter) for chapter in chapters]
+    return content_hash([str(with_solutions), *outputs], [*own, *code, *kept, ROOT / "_config.yml", *chapters_own])
 
 
 def _is_current(out: Path, key: str) -> bool:
@@ -328,11 +302,3 @@ def _listing(folder: Path) -> dict[str, list[int]]:
     """Size and time of every file, to notice a published page that was edited or lost."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     return {path.relative_to(folder).as_posix(): [path.stat().st_size, path.stat().st_mtime_ns] for path in files}
-
-
-@contextmanager
-def _one_at_a_time(work: str) -> Iterator[None]:
-    """Wait for another process that does the same work in this checkout: both would write the same files."""
-    with open(cache_folder() / f"{work}.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield

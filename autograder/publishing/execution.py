@@ -2,18 +2,22 @@
 
 Contract: `executed_outputs(chapter)` has one list of outputs for each code cell of the chapter, in order; a stub's are those of
 its check. Whatever a reader should not meet on a page (a traceback, a warning, a check that does not pass, a widget that needs a
-kernel) ends the build with a BookError that names the chapter's file and line. Results are kept under a hash of
-everything that can change them; prose cannot, so editing it never runs code again.
+kernel) ends the build with a BookError that names the chapter's file and line. Results are kept under a hash of what they rest on
+(autograder.proving.dependencies): neither prose nor code that a page does not reach can change them, so editing it never runs code again.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
+import re
+import resource
 import sys
 import tempfile
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import nbformat
@@ -27,8 +31,16 @@ from nbformat.v4 import new_code_cell, new_notebook
 
 from autograder.authoring.chapter import Cell, Chapter
 from autograder.paths import COURSE_LIB, ROOT, RUNS
+from autograder.proving import side_by_side
+from autograder.proving.dependencies import Code
 from course_lib.chapters import REFERENCES
 
+RUN_BY = (
+    "autograder.authoring.freeze:write",
+    "autograder.authoring.artefacts:hand_in",
+    "autograder.publishing.execution:_environment",
+)
+STATES = 3  # of each chapter are kept, so that an undo or a change of branch runs nothing
 CELL_TIMEOUT = 300  # seconds; a page's cells together should need at most 60
 
 
@@ -36,31 +48,91 @@ class BookError(RuntimeError):
     """The book cannot be built; the message says where and what to do."""
 
 
+@dataclass(frozen=True)
+class Inputs:
+    """What a chapter's outputs depend on beside its own cells: a fingerprint of code, and files."""
+
+    code: str
+    files: tuple[Path, ...]
+
+
 def executed_outputs(chapter: Chapter) -> list[list[NotebookNode]]:
     """The outputs (nbformat 4) of each code cell of the chapter, run now or taken from the cache.
 
     Raises: BookError if a cell fails, writes to stderr, shows a kernel-bound widget, or a check does not pass.
     """
-    cached = cache_folder() / f"{chapter.assignment}-{execution_key(chapter)}.ipynb"
-    if not cached.exists():
-        replace_cached(cached, nbformat.writes(_execute(chapter)))
+    cached = _cached(chapter)
+    if cached.exists():
+        os.utime(cached)  # so that the states that are in use are those that are kept
+    else:
+        keep_cached(cached, nbformat.writes(_execute(chapter)))
     return [cell.outputs for cell in nbformat.read(cached, as_version=4).cells]
 
 
+def run_all(chapters: Sequence[Chapter], jobs: int | None = None) -> None:
+    """Run the chapters whose outputs are not in the cache, side by side, a thread each; those that took longest begin first.
+
+    Raises: BookError with everything that failed, after all others have been run.
+    """
+    waiting = sorted((chapter for chapter in chapters if not _cached(chapter).exists()), key=_last_seconds, reverse=True)
+    failures = []
+    for done in side_by_side.run(_run, waiting, jobs or os.cpu_count() or 1):
+        if isinstance(done.error, BookError):
+            failures.append(str(done.error))
+        elif done.error is not None:
+            failures.append(f"{done.item.assignment}: {type(done.error).__name__}: {done.error}")
+    if failures:
+        raise BookError("\n".join(failures))
+
+
+def _run(chapter: Chapter) -> None:
+    executed_outputs(chapter)
+
+
+def _last_seconds(chapter: Chapter) -> float:
+    """The processor time of a chapter when it was last run; one that never was might take long."""
+    kept = sorted(cache_folder().glob(f"{chapter.assignment}-*.ipynb"), key=lambda path: path.stat().st_mtime)
+    return json.loads(kept[-1].read_text(encoding="utf-8"))["metadata"].get("cpu_seconds", 0.0) if kept else float("inf")
+
+
+def _cached(chapter: Chapter) -> Path:
+    return cache_folder() / f"{chapter.assignment}-{execution_key(chapter)}.ipynb"
+
+
 def execution_key(chapter: Chapter) -> str:
-    """A hash of all that can change a chapter's outputs: its code, the library, the references, its checks, its records, the pins."""
-    return content_hash([_source(chapter, cell) for cell in _code_cells(chapter)], code_inputs(chapter))
+    """A hash of all that can change a chapter's outputs: its code, what that reaches, its records, the pins."""
+    inputs = code_inputs(chapter)
+    return content_hash([*(_source(chapter, cell) for cell in _code_cells(chapter)), inputs.code], inputs.files)
 
 
-def code_inputs(chapter: Chapter) -> list[Path]:
-    """The files outside the chapter that its outputs depend on."""
-    library = [
-        path for path in COURSE_LIB.rglob("*") if path.is_file() and not {"frozen", "runs", "__pycache__"} & set(path.parts)
+def code_inputs(chapter: Chapter) -> Inputs:
+    """What a chapter's outputs depend on outside of it: the code that its cells and its frozen checks reach, the data files
+    that this code names, the records of its experiments, the pins."""
+    own = f"autograder.checks.{chapter.assignment}"
+    cells = [_source(chapter, cell) for cell in _code_cells(chapter)]
+    reached = Code(ROOT).reach([*RUN_BY, own], cells)
+    data = [
+        path
+        for folder in (COURSE_LIB, ROOT / "solutions")
+        for path in _data(folder)
+        if reached.mentions(path.relative_to(folder))
     ]
-    checks = [ROOT / "autograder" / name for name in ("spec.py", "freeze.py", f"checks/{chapter.assignment}.py")]
-    recorded = [path for name in chapter.experiments for path in (RUNS / name).glob("[!.]*")]
-    answers = [path for suffix in ("py", "safetensors") for path in (ROOT / "solutions").glob(f"*.{suffix}")]
-    return [*library, *recorded, *answers, *checks, ROOT / "requirements.txt", ROOT / "constraints.txt"]
+    text = "\n".join(cells)
+    named = {name for name in _names(RUNS) if name in chapter.experiments or re.search(rf"[\"'/]{re.escape(name)}[\"'/]", text)}
+    places = [RUNS / name for name in named]
+    recorded = [path for place in places for path in (place.glob("[!.]*") if place.is_dir() else [place])]
+    return Inputs(reached.fingerprint, (*data, *recorded, ROOT / "requirements.txt", ROOT / "constraints.txt"))
+
+
+def _names(folder: Path) -> list[str]:
+    return [path.name for path in folder.glob("[!.]*")]
+
+
+def _data(folder: Path) -> list[Path]:
+    """The files below a folder that are not code, generated ones left out."""
+    generated = {"frozen", "runs", "__pycache__"}
+    files = (path for path in folder.rglob("*") if path.is_file() and path.suffix != ".py")
+    return [path for path in files if not generated & set(path.relative_to(folder).parts)]
 
 
 def content_hash(texts: Iterable[str], files: Iterable[Path]) -> str:
@@ -80,13 +152,14 @@ def cache_folder() -> Path:
     return folder
 
 
-def replace_cached(path: Path, text: str) -> None:
-    """Keep a result under `NAME-HASH.SUFFIX`, all of it or nothing, in place of those with another hash."""
-    for stale in path.parent.glob(f"{path.name.rpartition('-')[0]}-*{path.suffix}"):
-        stale.unlink()
+def keep_cached(path: Path, text: str) -> None:
+    """Keep a result under `NAME-HASH.SUFFIX`, all of it or nothing, beside the last of those with another hash."""
     unfinished = path.with_suffix(f".{os.getpid()}-unfinished")
     unfinished.write_text(text, encoding="utf-8")
     unfinished.replace(path)
+    states = path.parent.glob(f"{path.name.rpartition('-')[0]}-*{path.suffix}")
+    for stale in sorted(states, key=lambda state: state.stat().st_mtime_ns, reverse=True)[STATES:]:
+        stale.unlink(missing_ok=True)
 
 
 def _code_cells(chapter: Chapter) -> list[Cell]:
@@ -102,14 +175,17 @@ def _source(chapter: Chapter, cell: Cell) -> str:
 
 def _execute(chapter: Chapter) -> NotebookNode:
     from autograder import checks
-    from autograder.authoring import artefacts, freeze  # they load torch, which a build from the cache can do without
+    from autograder.authoring import (
+        artefacts,  # they load torch, which a build from the cache can do without
+        freeze,
+    )
 
     exercises = checks.exercises(chapter.assignment)
     freeze.write(exercises, COURSE_LIB / "frozen")
     cells = _code_cells(chapter)
     notebook = new_notebook(cells=[new_code_cell(_source(chapter, cell), metadata={"tags": sorted(cell.tags)}) for cell in cells])
     print(f"{chapter.assignment}: running {len(cells)} code cells", flush=True)
-    started = time.monotonic()
+    started, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
     with tempfile.TemporaryDirectory(prefix="course-book-") as folder:
         artefacts.hand_in(exercises, Path(folder))
         sockets = str(Path(folder) / "kernel.json")  # a short path, as addresses of local sockets must be
@@ -122,7 +198,10 @@ def _execute(chapter: Chapter) -> NotebookNode:
                     _run_cell(client, index, chapter, cell)
         finally:
             run_sync(kernels.shutdown_kernel)(now=True)  # nbclient leaves a manager that it was given running
-    print(f"{chapter.assignment}: ran in {time.monotonic() - started:.0f} s", flush=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    notebook.metadata["cpu_seconds"] = round(used, 1)
+    print(f"{chapter.assignment}: ran in {time.monotonic() - started:.0f} s, {used:.0f} s of processor time", flush=True)
     return notebook
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import re
-import subprocess
-import sys
 
 import nbformat
 import pytest
@@ -20,19 +19,32 @@ from autograder.publishing import book, execution
 HOW_TO_PAGES = sorted((ROOT / "book" / "how-to").glob("*.md"))
 
 
+MACHINERY = {
+    "autograder/authoring/freeze.py": "def write():\n    pass\n",
+    "autograder/authoring/artefacts.py": "def hand_in():\n    pass\n",
+    "autograder/publishing/execution.py": "def _environment():\n    pass\n",
+}
+
+
 @pytest.fixture
 def elsewhere(tmp_path, monkeypatch):
     """A course_lib, solutions and checks of our own, to change without touching the real ones."""
-    files = [
-        "course_lib/one.py",
-        "course_lib/frozen/case.npz",
-        "solutions/ch99.py",
-        "autograder/authoring/spec.py",
-        "autograder/authoring/freeze.py",
-    ]
-    for name in [*files, "autograder/checks/ch99.py", "requirements.txt", "constraints.txt"]:
+    files = MACHINERY | {
+        "course_lib/__init__.py": "from course_lib.checks.client import check\n",
+        "course_lib/checks/client.py": "def check():\n    return 1\n",
+        "course_lib/one.py": "def one():\n    return open('numbers.csv')\n\ndef two():\n    return 2\n",
+        "course_lib/data/numbers.csv": "1\n",
+        "course_lib/data/others.csv": "1\n",
+        "course_lib/frozen/case.npz": "",
+        "solutions/ch99.py": "from course_lib.one import one\n\ndef double(x):\n    return one()\n\ndef quadruple(x):\n    return 4 * x\n",
+        "solutions/ch46.py": "def unrelated():\n    return 1\n",
+        "autograder/checks/ch99.py": "from solutions.ch99 import double\n\nEXERCISES = (double,)\n",
+        "requirements.txt": "",
+        "constraints.txt": "",
+    }
+    for name, text in files.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text("first\n")
+        (tmp_path / name).write_text(text)
     monkeypatch.setattr(execution, "ROOT", tmp_path)
     monkeypatch.setattr(execution, "COURSE_LIB", tmp_path / "course_lib")
     return tmp_path
@@ -66,11 +78,39 @@ def test_code_runs_again_after_a_change_of_code(tiny, elsewhere):
     assert execution.execution_key(changed) != execution.execution_key(tiny.chapter)
 
 
-@pytest.mark.parametrize("name", ["course_lib/one.py", "solutions/ch99.py", "autograder/checks/ch99.py", "constraints.txt"])
-def test_code_runs_again_after_a_change_of(name, tiny, elsewhere):
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("course_lib/one.py", "'numbers.csv'", "'numbers.csv', 'rb'"),
+        ("course_lib/data/numbers.csv", "1", "2"),
+        ("course_lib/checks/client.py", "return 1", "return 2"),
+        ("solutions/ch99.py", "4 * x", "x * 4"),
+        ("autograder/checks/ch99.py", "(double,)", "(double, double)"),
+        ("autograder/authoring/freeze.py", "pass", "return 1"),
+        ("constraints.txt", "", "torch==3"),
+    ],
+)
+def test_code_runs_again_after_a_change_of(name, old, new, tiny, elsewhere):
     key = execution.execution_key(tiny.chapter)
-    (elsewhere / name).write_text("second\n")
+    (elsewhere / name).write_text((elsewhere / name).read_text().replace(old, new))
     assert execution.execution_key(tiny.chapter) != key
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("course_lib/one.py", "return 2", "return 3"),
+        ("course_lib/one.py", "def one", "# a comment\ndef one"),
+        ("course_lib/data/others.csv", "1", "2"),
+        ("course_lib/frozen/case.npz", "", "generated"),
+        ("solutions/ch46.py", "return 1", "return 2"),
+        ("solutions/ch99.py", "4 * x", "4 * x  # a comment"),
+    ],
+)
+def test_code_does_not_run_again_after_a_change_of(name, old, new, tiny, elsewhere):
+    key = execution.execution_key(tiny.chapter)
+    (elsewhere / name).write_text((elsewhere / name).read_text().replace(old, new))
+    assert execution.execution_key(tiny.chapter) == key
 
 
 def test_a_new_record_of_a_chapters_experiment_runs_it_again(tiny, elsewhere, tmp_path, monkeypatch):
@@ -82,26 +122,15 @@ def test_a_new_record_of_a_chapters_experiment_runs_it_again(tiny, elsewhere, tm
     assert execution.execution_key(page) != key
 
 
-def test_generated_checks_do_not_count_as_a_change(tiny, elsewhere):
-    key = execution.execution_key(tiny.chapter)
-    (elsewhere / "course_lib/frozen/case.npz").write_text("second\n")
-    assert execution.execution_key(tiny.chapter) == key
-
-
 def chapter_with(tmp_path, monkeypatch, code, tags=""):
     """A chapter of one cell, and the builder's folders in tmp_path."""
     monkeypatch.setattr(execution, "ROOT", tmp_path)
     monkeypatch.setattr(execution, "COURSE_LIB", tmp_path / "course_lib")
     monkeypatch.setattr("autograder.checks.exercises", lambda assignment: ())
-    for name in (
-        "requirements.txt",
-        "constraints.txt",
-        "autograder/authoring/spec.py",
-        "autograder/authoring/freeze.py",
-        "autograder/checks/ch97.py",
-    ):
+    files = MACHINERY | dict.fromkeys(["requirements.txt", "constraints.txt", "autograder/checks/ch97.py"], "")
+    for name, text in files.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).touch()
+        (tmp_path / name).write_text(text)
     options = "chapter: 97\ntitle: T\nminutes: 1\nprerequisites: []\nbuilds: b\nsummary: s\n"
     path = tmp_path / "ch97_one.md"
     path.write_text(f"---\n{options}---\n\n# Words\n\n```{{code-cell}} ipython3\n---\ntags: [live{tags}]\n---\n{code}\n```\n")
@@ -129,6 +158,60 @@ def test_outputs_are_those_of_each_code_cell_and_come_from_the_cache_the_second_
     assert output.text == "1 1\n"
     monkeypatch.setattr(execution, "_execute", None)
     assert execution.executed_outputs(chapter) == [[output]]
+
+
+def test_the_last_three_states_are_kept_so_that_an_undo_runs_nothing(tmp_path, monkeypatch):
+    def outputs(number):
+        chapter = chapter_with(tmp_path, monkeypatch, f"print({number})")
+        return [output.text for output in execution.executed_outputs(chapter)[0]]
+
+    for number in range(4):
+        assert outputs(number) == [f"{number}\n"]
+    monkeypatch.setattr(execution, "_execute", None)
+    assert [outputs(number) for number in (1, 2, 3)] == [["1\n"], ["2\n"], ["3\n"]]
+    assert len(list(execution.cache_folder().glob("ch97-*.ipynb"))) == 3
+    with pytest.raises(TypeError):  # it would run: the oldest has made room
+        outputs(0)
+
+
+def test_a_state_that_is_used_is_not_the_one_that_makes_room(tmp_path):
+    for number in (1, 2, 3):
+        execution.keep_cached(tmp_path / f"ch97-{number}.ipynb", "")
+        os.utime(tmp_path / f"ch97-{number}.ipynb", (number, number))
+    os.utime(tmp_path / "ch97-1.ipynb", (9, 9))
+    execution.keep_cached(tmp_path / "ch97-4.ipynb", "")
+    assert {path.stem for path in tmp_path.iterdir()} == {"ch97-1", "ch97-3", "ch97-4"}
+
+
+def test_all_chapters_run_and_every_error_is_told(tiny, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(execution, "ROOT", tmp_path)
+    monkeypatch.setattr(execution, "execution_key", lambda chapter: "key")
+    ran = []
+
+    def execute(chapter):
+        ran.append(chapter.number)
+        if chapter.number != 98:
+            raise execution.BookError(f"{chapter.number} fails")
+        return nbformat.v4.new_notebook(metadata={"cpu_seconds": 3.0})
+
+    monkeypatch.setattr(execution, "_execute", execute)
+    chapters = [dataclasses.replace(tiny.before, number=number) for number in (97, 98, 99)]
+    for _ in range(2):
+        with pytest.raises(execution.BookError, match=r"^97 fails\n99 fails$"):
+            execution.run_all(chapters, jobs=1)
+    assert ran == [97, 98, 99, 97, 99]  # 98 is kept
+
+
+def test_those_that_took_longest_begin_first(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr(execution, "ROOT", tmp_path)
+    monkeypatch.setattr(execution, "execution_key", lambda chapter: "new")
+    monkeypatch.setattr(execution, "_execute", lambda chapter: ran.append(chapter.number) or nbformat.v4.new_notebook())
+    ran: list[int] = []
+    for number, seconds in ((96, 3.0), (97, 20.0), (98, 1.0)):
+        notebook = nbformat.v4.new_notebook(metadata={"cpu_seconds": seconds})
+        execution.keep_cached(execution.cache_folder() / f"ch{number}-old.ipynb", nbformat.writes(notebook))
+    execution.run_all([dataclasses.replace(tiny.before, number=number) for number in (96, 97, 98, 99)], jobs=1)
+    assert ran == [99, 97, 96, 98]  # nobody knows how long a new one takes
 
 
 def test_table_of_contents_comes_from_the_front_matter(tiny):
@@ -168,14 +251,6 @@ def test_kill_matrix_shows_the_agents_behind_the_thresholds_of_a_file():
     assert r"| It descends \| the hill. | yes | 20 | 201 | 250 | 272 | 0 | 1 | 0.4% |" in page
 
 
-def test_kill_matrix_is_keyed_on_all_modules_that_decide_it():
-    imports = "import sys, autograder.killmatrix, autograder.checks as checks; checks.all_exercises()"
-    loaded = f"{imports}; print(*(name for name in sys.modules if name.startswith('course_lib.')))"
-    output = subprocess.run([sys.executable, "-c", loaded], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    used = {name.removeprefix("course_lib.") for name in output.split()} & set(book.WITHOUT_A_SAY)
-    assert used <= {"artefact", "chapters", "checking", "flight", "notebook"}  # loaded by the package, or by what freezes
-
-
 def test_staging_touches_changed_files_only_and_removes_what_has_gone(tmp_path):
     assert not book.sync({"a/one": b"1", "two": b"2"}, tmp_path)
     before = (tmp_path / "a/one").stat().st_mtime_ns
@@ -191,7 +266,8 @@ def bare(tiny, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(book, "all_chapters", lambda: [tiny.before, tiny.chapter])
         patch.setattr(book, "executed_outputs", lambda chapter: tiny.outputs if chapter.number == 99 else [])
-        patch.setattr(book, "kill_rows", lambda chapter: [])
+        patch.setattr(book, "run_all", lambda chapters: None)
+        patch.setattr(book, "kill_rows", lambda chapter, keys: [])
         patch.setattr(book, "_build_key", lambda chapters, with_solutions: "tiny")
         patch.setattr(book, "cache_folder", lambda: folder)
         patch.setattr(book, "STAGE", folder / "stage")

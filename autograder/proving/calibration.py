@@ -16,9 +16,10 @@ larger of two estimates:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -81,6 +82,31 @@ def rows(artefact: Artefact, found: Sequence[Group]) -> list[Row]:
         counts = (int((means >= high).sum()), int((means >= half).sum()))
         result.append(Row(group.variant, group.mistake, len(means), *spread, *counts, chance))
     return result
+
+
+def printed(artefact: Artefact) -> dict[str, Any]:
+    """The rows as the book prints them, as plain data."""
+    return {
+        "exercise": artefact.name,
+        "thresholds": list(artefact.thresholds),
+        "episodes": artefact.episodes,
+        "wrong": list(artefact.wrong),
+        "agents": [asdict(row) for row in rows(artefact, groups(artefact))],
+    }
+
+
+def report(row: Mapping[str, Any], right: str) -> list[str]:
+    """Where the agents behind an exercise's thresholds miss the bar; `right` is the variant that was trained rightly."""
+    lines = []
+    for agents in row["agents"]:
+        name, chance = f"{row['exercise']}: agents {agents['variant']!r}", f"{agents['chance']:.1%}"
+        if agents["variant"] == right and (agents["full"] < agents["agents"] or agents["chance"] > BAR):
+            lines.append(
+                f"{name}: {agents['full']} of {agents['agents']} earn all points, and a further one less by a chance of {chance}"
+            )
+        if agents["variant"] in row["wrong"] and (agents["half"] or agents["chance"] > BAR_WRONG):
+            lines.append(f"{name}: {agents['half']} of {agents['agents']} earn half, and a further one by a chance of {chance}")
+    return lines
 
 
 def chance_below(returns: np.ndarray, mark: float, seed: int = 0) -> float:

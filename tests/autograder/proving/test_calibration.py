@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from autograder import calibration, checks
+from autograder import checks
 from autograder.authoring import artefacts
 from autograder.authoring.spec import Artefact
 from autograder.grading import flights
+from autograder.proving import calibration
 from course_lib.figures import records
 
 ARTEFACTS = [exercise for exercise in checks.all_exercises() if isinstance(exercise, Artefact)]
@@ -74,6 +75,25 @@ def test_the_agents_of_an_experiment_are_those_trained_for_it(tmp_path):
         ("broken_sign", "It descends.", (1, 3)),
         ("broken_mask", "It looks away.", (1, 3)),
     ]
+
+
+@pytest.mark.parametrize(
+    ("agents", "told"),
+    [
+        ([260, 250, 240, 230], []),
+        ([260, 250, 240, 150], ["train: agents 'ours': 3 of 4 earn all points"]),
+    ],
+)
+def test_agents_that_miss_the_bar_are_told(agents, told):
+    train = Artefact("train", lambda: None, "f", "lander", 4.0, (0.0, 200.0), wrong=["masked"])
+    returns = np.repeat(np.array(agents, dtype=float)[:, None], 5, axis=1)
+    found = [calibration.Group("ours", "", returns), calibration.Group("masked", "It looks away.", returns)]
+    row = {"exercise": "train", "wrong": ["masked"], "agents": [vars(row) for row in calibration.rows(train, found)]}
+    lines = calibration.report(row, "ours")
+    mistaken = f"train: agents 'masked': {sum(mean >= 100 for mean in agents)} of 4 earn half"
+    assert lines[-1].startswith(mistaken)
+    if told:
+        assert lines[0].startswith(told[0])
 
 
 @pytest.mark.parametrize("artefact", ARTEFACTS, ids=lambda artefact: artefact.name)
