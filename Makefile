@@ -50,7 +50,7 @@ $(INSTALLED): requirements.txt constraints.txt pyproject.toml
 	  exit 1; }
 	@echo "Setting up .venv with $$("$(PYTHON)" --version): the pinned packages come from the package index, 1 to 5 GB, in 2 to 10 minutes."
 	"$(PYTHON)" -m venv .venv
-	$(BIN)/python -m pip install --progress-bar off -r requirements.txt | grep --line-buffered -E '^(Collecting|Installing|Successfully)' | cut -c1-110
+	$(BIN)/python -m pip install --progress-bar off -r requirements.txt | sed -unE 's/^(Collecting|Installing|Successfully)(.{0,100}).*/\1\2/p'
 	$(BIN)/python -m pip install --quiet --no-deps -e .
 	@touch $@
 	@echo "Set up. 'make book' builds the book, 'make test' proves it."

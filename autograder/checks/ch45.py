@@ -1044,7 +1044,7 @@ PPO_LOSS = Exercise(
 
 def _vector_env(maker, seed, steps=0, action=0.0, **options):
     """A running vector environment, as an argument, and what it shows."""
-    env = built(f"envs.{maker}", **options)
+    env = built(f"control.envs.{maker}", **options)
     running = environments.begun(getattr(environments, maker)(**options), seed, steps, action)
     return built("control.envs.begun", envs=env, seed=seed, steps=steps, action=action), np.array(running.observe())
 
