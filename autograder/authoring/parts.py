@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import inspect
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import torch
 
 from autograder.authoring.spec import Case, Inputs, Misconception
+
+Check = Callable[[Mapping[str, Any]], None]
+"""Looks at the arguments of a call by name, and raises a ValueError that names those which it refuses."""
 
 SCALAR = "Return a 0-dim tensor, not a Python float: .item() cuts the graph that the optimiser needs."
 DTYPE = "The result has lost the inputs' dtype: cast masks and counts with .to(x.dtype), not with .float()."
@@ -81,6 +85,68 @@ def drawn_once(*cases: Case) -> tuple[Case, ...]:
 def after(function: Callable, change: Callable) -> Callable:
     """Right, and then spoilt."""
     return lambda *args, **kwargs: change(function(*args, **kwargs))
+
+
+def versions_of(reference: Callable, *checks: Check, data: Sequence[str] = ()) -> Callable:
+    """What makes a formula a whole answer to an exercise, right or wrong: `versions_of(...)(formula)`.
+
+    The answer has the reference's parameters and defaults, and hands them to `formula` in this order. Before, it lets `checks` look at
+    them, unless it is made with `checked=False`, and detaches those that `data` names, unless with `leak=True`.
+    """
+    signature = inspect.signature(reference)
+
+    def version(formula: Callable, checked: bool = True, leak: bool = False) -> Callable:
+        def answer(*args, **kwargs):
+            bound = signature.bind(*args, **kwargs)
+            bound.apply_defaults()
+            given = bound.arguments
+            for check in checks if checked else ():
+                check(given)
+            for name in () if leak else data:
+                if isinstance(given[name], torch.Tensor):
+                    given[name] = given[name].detach()
+            return formula(*given.values())
+
+        return answer
+
+    return version
+
+
+def one_shape(*names: str) -> Check:
+    """A check that arguments agree in shape, in another style than the references', which use course_lib.validate."""
+
+    def check(given: Mapping[str, Any]) -> None:
+        shapes = {name: tuple(given[name].shape) for name in names}
+        if len(set(shapes.values())) > 1:
+            raise ValueError(f"shapes that must agree, and do not: {shapes}")
+
+    return check
+
+
+def satisfies(rule: Callable[..., Any]) -> Check:
+    """A check by a rule: its parameters are named as the arguments that it is about, and so does the error name them."""
+    names = list(inspect.signature(rule).parameters)
+
+    def check(given: Mapping[str, Any]) -> None:
+        if not rule(*(given[name] for name in names)):
+            raise ValueError(f"refused: {' and '.join(names)}")
+
+    return check
+
+
+def number(*values: float) -> Callable:
+    """A closed form of cases in which the answer is known: this number, or the vector of these."""
+    return lambda **_given: torch.tensor(values if len(values) > 1 else values[0], dtype=torch.float64)
+
+
+def wrong(answers: Mapping[str, tuple[Any, str]], of: Callable = lambda answer: answer) -> tuple[Misconception, ...]:
+    """Wrong answers by name, each with what its author should look at. `of` makes them whole where they are formulas only."""
+    return tuple(Misconception(name, of(answer), message) for name, (answer, message) in answers.items())
+
+
+def bad_input_accepted(answer: Callable, message: str = SHAPES) -> Misconception:
+    """Right, but for what should be refused."""
+    return Misconception("bad-input-accepted", answer, message)
 
 
 def dtype_lost(function: Callable) -> Misconception:

@@ -9,16 +9,29 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from autograder.authoring.parts import (
+    METRIC,
+    after,
+    bad_input_accepted,
+    cut_from_graph,
+    dtype_lost,
+    in_place,
+    integers,
+    normal,
+    number,
+    one_shape,
+    python_float,
+    reshaped,
+    satisfies,
+    uniform,
+    versions_of,
+    wrong,
+)
 from autograder.authoring.spec import Case, Exercise, Misconception
-from course_lib import validate
 from course_lib.checks.cases import built
 from solutions import ch80
 
 # ------------------------------------------------------------------------------------------------------- inputs
-
-
-def _normal(generator, *shape):
-    return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
 
 def _lengths_to_mask(lengths, steps):
@@ -29,9 +42,9 @@ def _segments(batch=6, steps=9, full=False):
     """Segments of unequal length, padded behind with numbers that would be noticed."""
 
     def inputs(generator):
-        lengths = torch.randint(2, steps, (batch,), generator=generator)
+        lengths = integers(generator, 2, steps, batch)
         mask = torch.ones(batch, steps, dtype=torch.bool) if full else _lengths_to_mask(lengths, steps)
-        rewards = 0.5 + _normal(generator, batch, steps)
+        rewards = 0.5 + normal(generator, batch, steps)
         return {"rewards": torch.where(mask, rewards, 3 + rewards), "mask": mask}
 
     return inputs
@@ -65,7 +78,7 @@ def _returns(spread=1.5, size=33, level=0.0, first="returns_a", second="returns_
     """Returns of `size` pairs around `level`, the first of each pair ahead by `lead` on average."""
 
     def inputs(generator):
-        drawn = level + spread * _normal(generator, 2, size)
+        drawn = level + spread * normal(generator, 2, size)
         return {first: drawn[0] + lead, second: drawn[1]}
 
     return inputs
@@ -75,7 +88,7 @@ def _gaps(*gaps, first="returns_a", second="returns_b"):
     """Pairs with exactly these gaps."""
 
     def inputs(generator):
-        returns = torch.randint(-4, 5, (len(gaps),), generator=generator).double()  # whole numbers: the gaps stay exact
+        returns = integers(generator, -4, 5, len(gaps)).double()  # whole numbers: the gaps stay exact
         return {first: returns + torch.tensor(gaps, dtype=torch.float64), second: returns}
 
     return inputs
@@ -89,80 +102,24 @@ def _choice_gaps(*gaps):
     return _gaps(*gaps, first="chosen_returns", second="rejected_returns")
 
 
-def _reshaped(name, change, inputs):
-    def wrong_shape(generator):
-        drawn = inputs(generator)
-        return drawn | {name: change(drawn[name])}
-
-    return wrong_shape
-
-
 def _shape_cases(names, inputs):
     """A column broadcasts silently to a table of all pairs; a batch that is too short fails later and elsewhere."""
     column, short = (lambda x: x[:, None]), (lambda x: x[:-1])
     return (
-        Case(f"{names[1]} as a column", _reshaped(names[1], column, inputs), raises=names, visible=True, draws=1),
-        Case(f"{names[0]} as a column", _reshaped(names[0], column, inputs), raises=names, draws=1),
-        Case(f"{names[1]} of one entry", _reshaped(names[1], lambda x: x[:1], inputs), raises=names, draws=1),
-        Case(f"{names[1]} with an entry too few", _reshaped(names[1], short, inputs), raises=names, draws=1),
+        Case(f"{names[1]} as a column", reshaped(inputs, names[1], column), raises=names, visible=True, draws=1),
+        Case(f"{names[0]} as a column", reshaped(inputs, names[0], column), raises=names, draws=1),
+        Case(f"{names[1]} of one entry", reshaped(inputs, names[1], lambda x: x[:1]), raises=names, draws=1),
+        Case(f"{names[1]} with an entry too few", reshaped(inputs, names[1], short), raises=names, draws=1),
     )
 
 
-# ------------------------------------------------------------------------------------- wrong answers, in general
-
-_VALIDATE = (
-    "Shapes that differ broadcast silently, (B, 1) against (B,) to a table of all pairs. Check the arguments first: "
-    "course_lib.validate raises errors that name them."
-)
-_DTYPE = "The result has lost the inputs' dtype: cast with .to(x.dtype), not with .float()."
-_SCALAR = "Return a 0-dim tensor, not a Python float: .item() cuts the graph that the optimiser needs."
-_DETACHED = "No gradient comes through, so the reward model cannot learn from it: detach nothing here."
-_IN_PLACE = "The caller's tensor is changed (by -=, an assignment, or a method that ends in _): make a new one."
 _REVERSED = "The order is reversed: the gap is the first argument minus the second."
-
-
-def _after(function, change):
-    """Right, and then spoilt."""
-    return lambda *args, **kwargs: change(function(*args, **kwargs))
-
-
-def _spoilt(function):
-    return (
-        Misconception("graph-cut", _after(function, torch.Tensor.detach), _DETACHED),
-        Misconception("dtype-lost", _after(function, torch.Tensor.float), _DTYPE),
-    )
-
-
-def _refuse(**tensors):
-    """Another style of validation than the reference's."""
-    first, *others = tensors
-    for name in others:
-        if tensors[name].shape != tensors[first].shape:
-            raise ValueError(f"{name} has shape {tuple(tensors[name].shape)}, but {first} has {tuple(tensors[first].shape)}")
-
+_ONE_MASK_FOR_ALL = "A mask of one row or column broadcasts silently over all segments: compare the shapes first."
 
 # ----------------------------------------------------------------------------------------------- segment_returns
 
 _STEPS = ("rewards", "mask")
-
-
-def _masked(formula, checked=True):
-    """A version of a function of rewards and mask; `formula` takes r and m."""
-
-    def version(rewards, mask):
-        if checked:
-            validate.same_shape(rewards=rewards, mask=mask)
-        return formula(rewards, mask)
-
-    return version
-
-
-def _masked_variant(formula):
-    def variant(rewards, mask):
-        _refuse(rewards=rewards, mask=mask)
-        return formula(rewards, mask)
-
-    return variant
+_masked = versions_of(ch80.segment_returns, one_shape(*_STEPS))
 
 
 def _sum_in_python(rewards, mask):
@@ -189,11 +146,32 @@ def _last_kept(r, m):
     return torch.where(m.any(1), r.gather(1, last[:, None])[:, 0], 0)
 
 
-def _zeroed_in_place(r, m):
-    with torch.no_grad():
-        r[~m] = 0
-    return ch80.segment_returns(r, m)
-
+_WRONG_SEGMENT_RETURNS = {
+    "mask-ignored": (lambda r, m: r.sum(-1), "The padding is added as well: use the mask."),
+    "mask-inverted": (lambda r, m: (r * ~m).sum(-1), "This adds up the padding: True marks the steps to keep."),
+    "mean-instead-of-sum": (
+        lambda r, m: (r * m).sum(-1) / m.sum(-1).clamp(min=1),
+        "A mean forgets how long a segment is: ten good steps are worth more than one. Sum the kept rewards.",
+    ),
+    "mean-over-padded-length": (
+        lambda r, m: (r * m).mean(-1),
+        "Dividing by the padded length T rescales the returns, and with them what a gap of 1 means: sum instead.",
+    ),
+    "padding-assumed-behind": (
+        lambda r, m: (r * _lengths_to_mask(m.sum(-1), m.shape[1])).sum(-1),
+        "The first mask.sum() steps are taken, wherever the kept ones are: select by the mask itself.",
+    ),
+    "last-reward-only": (_last_kept, "Only the last kept reward counts here: sum them all."),
+    "discounted": (_discounted, "No discount here: a segment's return is the plain sum."),
+    "summed-over-segments": (
+        lambda r, m: (r * m).sum(0),
+        "This adds up different segments, step by step: sum over the last axis.",
+    ),
+    "one-sum-for-all": (
+        lambda r, m: r[m].sum(),
+        "rewards[mask] is flat and forgets which segment a reward belongs to: set padding to 0, then sum each row.",
+    ),
+}
 
 SEGMENT_RETURNS = Exercise(
     name="segment_returns",
@@ -209,87 +187,33 @@ SEGMENT_RETURNS = Exercise(
         Case("one segment", _segments(batch=1), closed_form=_sum_in_python),
         Case("rewards that require gradient", _segments(), differentiate=["rewards"], visible=True),
         Case("single precision", _segments(), dtype=torch.float32, visible=True),
-        Case("mask of one row", _reshaped("mask", lambda m: m[0], _segments()), raises=_STEPS, visible=True, draws=1),
-        Case("mask of one column", _reshaped("mask", lambda m: m[:, :1], _segments()), raises=_STEPS, draws=1),
-        Case("mask with a step too few", _reshaped("mask", lambda m: m[:, 1:], _segments()), raises=_STEPS, draws=1),
+        Case("mask of one row", reshaped(_segments(), "mask", lambda m: m[0]), raises=_STEPS, visible=True, draws=1),
+        Case("mask of one column", reshaped(_segments(), "mask", lambda m: m[:, :1]), raises=_STEPS, draws=1),
+        Case("mask with a step too few", reshaped(_segments(), "mask", lambda m: m[:, 1:]), raises=_STEPS, draws=1),
     ),
     misconceptions=(
-        Misconception("mask-ignored", _masked(lambda r, m: r.sum(-1)), "The padding is added as well: use the mask."),
-        Misconception(
-            "mask-inverted", _masked(lambda r, m: (r * ~m).sum(-1)), "This adds up the padding: True marks the steps to keep."
-        ),
-        Misconception(
-            "mean-instead-of-sum",
-            _masked(lambda r, m: (r * m).sum(-1) / m.sum(-1).clamp(min=1)),
-            "A mean forgets how long a segment is: ten good steps are worth more than one. Sum the kept rewards.",
-        ),
-        Misconception(
-            "mean-over-padded-length",
-            _masked(lambda r, m: (r * m).mean(-1)),
-            "Dividing by the padded length T rescales the returns, and with them what a gap of 1 means: sum instead.",
-        ),
-        Misconception(
-            "padding-assumed-behind",
-            _masked(lambda r, m: (r * _lengths_to_mask(m.sum(-1), m.shape[1])).sum(-1)),
-            "The first mask.sum() steps are taken, wherever the kept ones are: select by the mask itself.",
-        ),
-        Misconception("last-reward-only", _masked(_last_kept), "Only the last kept reward counts here: sum them all."),
-        Misconception("discounted", _masked(_discounted), "No discount here: a segment's return is the plain sum."),
-        Misconception(
-            "summed-over-segments",
-            _masked(lambda r, m: (r * m).sum(0)),
-            "This adds up different segments, step by step: sum over the last axis.",
-        ),
-        Misconception(
-            "one-sum-for-all",
-            _masked(lambda r, m: r[m].sum()),
-            "rewards[mask] is flat and forgets which segment a reward belongs to: set padding to 0, then sum each row.",
-        ),
-        *_spoilt(ch80.segment_returns),
-        Misconception("rewards-changed-in-place", _masked(_zeroed_in_place), _IN_PLACE),
-        Misconception(
-            "bad-input-accepted",
+        *wrong(_WRONG_SEGMENT_RETURNS, _masked),
+        cut_from_graph(ch80.segment_returns),
+        dtype_lost(ch80.segment_returns),
+        in_place(ch80.segment_returns, "rewards"),
+        bad_input_accepted(
             _masked(lambda r, m: r[:, -m.shape[-1] :].masked_fill(~m, 0).sum(-1), checked=False),
-            "A mask of one row or column broadcasts silently over all segments: compare the shapes first.",
+            _ONE_MASK_FOR_ALL,
         ),
     ),
     variants={
-        "product with the mask": _masked_variant(lambda r, m: (r * m).sum(-1)),
-        "torch.where": _masked_variant(lambda r, m: torch.where(m, r, torch.zeros_like(r)).sum(dim=1)),
-        "one number at a time": _masked_variant(_sum_in_python),
-        "index_add": _masked_variant(_scattered),
-        "einsum in double precision": _masked_variant(lambda r, m: torch.einsum("bt,bt->b", r.double(), m.double()).to(r.dtype)),
+        "product with the mask": _masked(lambda r, m: (r * m).sum(-1)),
+        "torch.where": _masked(lambda r, m: torch.where(m, r, torch.zeros_like(r)).sum(dim=1)),
+        "one number at a time": _masked(_sum_in_python),
+        "index_add": _masked(_scattered),
+        "einsum in double precision": _masked(lambda r, m: torch.einsum("bt,bt->b", r.double(), m.double()).to(r.dtype)),
     },
 )
 
 # ---------------------------------------------------------------------------------------- preference_probability
 
 _PAIR = ("returns_a", "returns_b")
-
-
-def _pair(formula, checked=True):
-    """A version of the model; `formula` takes a and b."""
-
-    def version(returns_a, returns_b):
-        if checked:
-            validate.same_shape(returns_a=returns_a, returns_b=returns_b)
-        return formula(returns_a, returns_b)
-
-    return version
-
-
-def _pair_variant(formula):
-    def variant(returns_a, returns_b):
-        _refuse(returns_a=returns_a, returns_b=returns_b)
-        return formula(returns_a, returns_b)
-
-    return variant
-
-
-def _probability_by_sides(a, b):
-    """exp of negative numbers only."""
-    small = torch.exp(-(a - b).abs())
-    return torch.where(a >= b, 1, small) / (1 + small)
+_pair = versions_of(ch80.preference_probability, one_shape(*_PAIR))
 
 
 def _odds_by_hand(returns_a, returns_b):
@@ -298,12 +222,36 @@ def _odds_by_hand(returns_a, returns_b):
     )
 
 
-def _pair_in_place(a, b):
-    probability = torch.sigmoid(a - b)
-    with torch.no_grad():
-        a -= b
-    return probability
-
+_WRONG_PREFERENCE_PROBABILITY = {
+    "order-reversed": (lambda a, b: torch.sigmoid(b - a), _REVERSED),
+    "exponentials-divided": (
+        lambda a, b: a.exp() / (a.exp() + b.exp()),
+        "Right on paper, but exp(1000) is infinite and the quotient NaN: only the difference of the returns matters, so form it first.",
+    ),
+    "returns-divided": (
+        lambda a, b: a / (a + b),
+        "a / (a + b) is the model for positive strengths; a return may be negative. The strengths are exp(return).",
+    ),
+    "certain-choice": (
+        lambda a, b: (a > b).to(a.dtype),
+        "A person errs where two segments are nearly alike: the answer is a probability, not a decision.",
+    ),
+    "difference-only": (lambda a, b: a - b, "This is the log-odds: the probability is its sigmoid."),
+    "log-probability": (lambda a, b: F.logsigmoid(a - b), "This is the logarithm of the probability."),
+    "second-return-ignored": (lambda a, b: torch.sigmoid(a), "A return says nothing alone: compare it with the other."),
+    "tanh-instead-of-sigmoid": (
+        lambda a, b: torch.tanh(a - b),
+        "tanh runs from -1 to 1: a tie must give one half, which the sigmoid does.",
+    ),
+    "normal-instead-of-logistic": (
+        lambda a, b: torch.special.ndtr(a - b),
+        "This is Thurstone's model (normal noise on each side). Bradley and Terry's is logistic: odds of exp(a - b).",
+    ),
+    "softmax-over-batch": (
+        lambda a, b: torch.softmax(a - b, dim=0),
+        "The pairs compete with one another here: the softmax runs over the two segments of a pair, not over the batch.",
+    ),
+}
 
 PREFERENCE_PROBABILITY = Exercise(
     name="preference_probability",
@@ -312,16 +260,11 @@ PREFERENCE_PROBABILITY = Exercise(
     axes=("pair",),
     cases=(
         Case("a batch of pairs", _returns(), closed_form=_odds_by_hand, visible=True, draws=3),
-        Case(
-            "equal returns: a coin",
-            _gaps(0.0, 0.0, 0.0),
-            closed_form=lambda returns_a, returns_b: torch.full((3,), 0.5, dtype=torch.float64),
-            visible=True,
-        ),
+        Case("equal returns: a coin", _gaps(0.0, 0.0, 0.0), closed_form=number(0.5, 0.5, 0.5), visible=True),
         Case(
             "gaps of log 3: three to one, either way",
             _gaps(math.log(3), -math.log(3)),
-            closed_form=lambda returns_a, returns_b: torch.tensor([0.75, 0.25], dtype=torch.float64),
+            closed_form=number(0.75, 0.25),
             visible=True,
         ),
         Case("gaps of ±1000", _gaps(1000.0, -1000.0), visible=True),
@@ -333,59 +276,20 @@ PREFERENCE_PROBABILITY = Exercise(
         *_shape_cases(_PAIR, _returns()),
     ),
     misconceptions=(
-        Misconception("order-reversed", _pair(lambda a, b: torch.sigmoid(b - a)), _REVERSED),
-        Misconception(
-            "exponentials-divided",
-            _pair(lambda a, b: a.exp() / (a.exp() + b.exp())),
-            "Right on paper, but exp(1000) is infinite and the quotient NaN: only the difference of the returns matters, "
-            "so form it first.",
-        ),
-        Misconception(
-            "returns-divided",
-            _pair(lambda a, b: a / (a + b)),
-            "a / (a + b) is the model for positive strengths; a return may be negative. The strengths are exp(return).",
-        ),
-        Misconception(
-            "certain-choice",
-            _pair(lambda a, b: (a > b).to(a.dtype)),
-            "A person errs where two segments are nearly alike: the answer is a probability, not a decision.",
-        ),
-        Misconception("difference-only", _pair(lambda a, b: a - b), "This is the log-odds: the probability is its sigmoid."),
-        Misconception("log-probability", _pair(lambda a, b: F.logsigmoid(a - b)), "This is the logarithm of the probability."),
-        Misconception(
-            "second-return-ignored",
-            _pair(lambda a, b: torch.sigmoid(a)),
-            "A return says nothing alone: compare it with the other.",
-        ),
-        Misconception(
-            "tanh-instead-of-sigmoid",
-            _pair(lambda a, b: torch.tanh(a - b)),
-            "tanh runs from -1 to 1: a tie must give one half, which the sigmoid does.",
-        ),
-        Misconception(
-            "normal-instead-of-logistic",
-            _pair(lambda a, b: torch.special.ndtr(a - b)),
-            "This is Thurstone's model (normal noise on each side). Bradley and Terry's is logistic: odds of exp(a - b).",
-        ),
-        Misconception(
-            "softmax-over-batch",
-            _pair(lambda a, b: torch.softmax(a - b, dim=0)),
-            "The pairs compete with one another here: the softmax runs over the two segments of a pair, not over the batch.",
-        ),
-        *_spoilt(ch80.preference_probability),
-        Misconception("returns-changed-in-place", _pair(_pair_in_place), _IN_PLACE),
-        Misconception(
-            "bad-input-accepted",
-            _pair(lambda a, b: torch.sigmoid(a[: len(b)] - b[: len(a)]) if len(b) > 1 else torch.sigmoid(a - b), checked=False),
-            _VALIDATE,
+        *wrong(_WRONG_PREFERENCE_PROBABILITY, _pair),
+        cut_from_graph(ch80.preference_probability),
+        dtype_lost(ch80.preference_probability),
+        in_place(ch80.preference_probability, "returns_a"),
+        bad_input_accepted(
+            _pair(lambda a, b: torch.sigmoid(a[: len(b)] - b[: len(a)]) if len(b) > 1 else torch.sigmoid(a - b), checked=False)
         ),
     ),
     variants={
-        "softmax over the two": _pair_variant(lambda a, b: torch.stack([a, b]).softmax(0)[0]),
-        "quotient with the difference": _pair_variant(lambda a, b: (1 + (b - a).exp()).reciprocal()),
-        "exponential of logsigmoid": _pair_variant(lambda a, b: F.logsigmoid(a - b).exp()),
-        "tanh of half the difference": _pair_variant(lambda a, b: (1 + torch.tanh((a - b) / 2)) / 2),
-        "log-sum-exp in double precision": _pair_variant(
+        "softmax over the two": _pair(lambda a, b: torch.stack([a, b]).softmax(0)[0]),
+        "quotient with the difference": _pair(lambda a, b: (1 + (b - a).exp()).reciprocal()),
+        "exponential of logsigmoid": _pair(lambda a, b: F.logsigmoid(a - b).exp()),
+        "tanh of half the difference": _pair(lambda a, b: (1 + torch.tanh((a - b) / 2)) / 2),
+        "log-sum-exp in double precision": _pair(
             lambda a, b: (a.double() - torch.logaddexp(a.double(), b.double())).exp().to(a.dtype)
         ),
     },
@@ -394,29 +298,7 @@ PREFERENCE_PROBABILITY = Exercise(
 # -------------------------------------------------------------------------------------------- bradley_terry_loss
 
 _CHOICE = ("chosen_returns", "rejected_returns")
-
-
-def _choice(formula, checked=True):
-    """A version of a function of choices; `formula` takes chosen and rejected returns."""
-
-    def version(chosen_returns, rejected_returns):
-        if checked:
-            validate.same_shape(chosen_returns=chosen_returns, rejected_returns=rejected_returns)
-        return formula(chosen_returns, rejected_returns)
-
-    return version
-
-
-def _choice_variant(formula):
-    def variant(chosen_returns, rejected_returns):
-        _refuse(chosen_returns=chosen_returns, rejected_returns=rejected_returns)
-        return formula(chosen_returns, rejected_returns)
-
-    return variant
-
-
-def _loss_of_gap(formula):
-    return _choice(lambda c, r: formula(c - r))
+_choice = versions_of(ch80.bradley_terry_loss, one_shape(*_CHOICE))
 
 
 def _loss_by_hand(chosen_returns, rejected_returns):
@@ -432,20 +314,82 @@ def _sum_or_all_pairs(c, r):
     return -F.logsigmoid(c[:count] - r[:count]).mean()
 
 
-def _choice_in_place(function):
-    def version(c, r):
-        result = function(c, r)
-        with torch.no_grad():
-            c -= r
-        return result
-
-    return version
-
-
 def _by_pairs(c, r):
     losses = [torch.logaddexp(chosen, rejected) - chosen for chosen, rejected in zip(c, r, strict=True)]
     return sum(losses) / len(losses)
 
+
+_WRONG_BRADLEY_TERRY_LOSS = {
+    "sign-missing": (
+        lambda c, r: F.logsigmoid(c - r).mean(),
+        "This is the log-likelihood, which is to be made large: a loss is minus that.",
+    ),
+    "order-reversed": (
+        lambda c, r: -F.logsigmoid(r - c).mean(),
+        "It rewards the model for disliking what was chosen: the gap is chosen minus rejected.",
+    ),
+    "sum-instead-of-mean": (
+        lambda c, r: -F.logsigmoid(c - r).sum(),
+        "A sum grows with the batch, and with it the step: take the mean over the pairs.",
+    ),
+    "not-averaged": (lambda c, r: -F.logsigmoid(c - r), "One loss for each pair comes back: take their mean."),
+    "overflow": (
+        lambda c, r: -torch.sigmoid(c - r).log().mean(),
+        "Where the model is very wrong this is infinite and its gradient NaN: sigmoid(-1000) is 0, and its logarithm "
+        "-inf (likewise log(1 + exp(1000))). F.logsigmoid takes both in one step.",
+    ),
+    "exponentials-divided": (
+        lambda c, r: -(c.exp() / (c.exp() + r.exp())).log().mean(),
+        "exp of a return of 1000 is infinite and the quotient NaN: form the difference of the returns first.",
+    ),
+    "probability-clamped": (
+        lambda c, r: -torch.sigmoid(c - r).clamp(min=1e-8).log().mean(),
+        "A probability kept away from 0 (by clamp or + 1e-8) caps the loss and stops the gradient just where the model "
+        "is most wrong. F.logsigmoid needs no such help.",
+    ),
+    "gap-clipped": (
+        lambda c, r: -F.logsigmoid((c - r).clamp(-20, 20)).mean(),
+        "Clipping the gap caps the loss and stops the gradient just where the model is most wrong.",
+    ),
+    "no-gradient-at-zero": (
+        lambda c, r: (torch.relu(r - c) + torch.log1p(torch.exp(-(c - r).abs()))).mean(),
+        "The values are right, but at a gap of exactly 0 both relu and abs have gradient 0 in PyTorch: a model that starts "
+        "with equal returns never moves. F.softplus(-x) or F.logsigmoid(x) are right there.",
+    ),
+    "probability-not-its-logarithm": (
+        lambda c, r: (1 - torch.sigmoid(c - r)).mean(),
+        "This is the expected number of mistakes. The likelihood's logarithm punishes confident mistakes much more.",
+    ),
+    "hinge": (
+        lambda c, r: torch.relu(1 - (c - r)).mean(),
+        "This is a hinge loss, which asks for a margin of 1 and then stops. Bradley-Terry never quite stops.",
+    ),
+    "share-of-mistakes": (
+        lambda c, r: (c < r).to(c.dtype).mean(),
+        "Counting mistakes passes no gradient: use the log-likelihood.",
+    ),
+    "segments-scored-apart": (
+        lambda c, r: -(F.logsigmoid(c) + F.logsigmoid(-r)).mean(),
+        "This classifies each segment as good or bad. A comparison says nothing of the level: only the gap may enter.",
+    ),
+    "mean-of-gaps-first": (
+        lambda c, r: -F.logsigmoid((c - r).mean()),
+        "The mean comes last: the average gap hides the pairs that the model has wrong.",
+    ),
+    "mean-of-probabilities-first": (
+        lambda c, r: -torch.sigmoid(c - r).mean().log(),
+        "Independent choices multiply: take each pair's logarithm, then the mean.",
+    ),
+    "base-two": (lambda c, r: -F.logsigmoid(c - r).mean() / math.log(2), "This is in bits: use the natural logarithm."),
+    "rejected-detached": (
+        lambda c, r: -F.logsigmoid(c - r.detach()).mean(),
+        "Both segments were scored by the model that learns: the rejected returns need their gradient, too.",
+    ),
+    "chosen-detached": (
+        lambda c, r: -F.logsigmoid(c.detach() - r).mean(),
+        "Both segments were scored by the model that learns: the chosen returns need their gradient, too.",
+    ),
+}
 
 BRADLEY_TERRY_LOSS = Exercise(
     name="bradley_terry_loss",
@@ -456,25 +400,13 @@ BRADLEY_TERRY_LOSS = Exercise(
         Case(
             "a model that sees no difference: log 2",
             _choice_gaps(0.0, 0.0, 0.0),
-            closed_form=lambda chosen_returns, rejected_returns: torch.tensor(math.log(2), dtype=torch.float64),
+            closed_form=number(math.log(2)),
             visible=True,
             draws=1,
         ),
         Case("one choice, against the model", _choice_gaps(-2.0), closed_form=_loss_by_hand, visible=True, draws=1),
-        Case(
-            "a gap of +1000: nothing to learn",
-            _choice_gaps(1000.0),
-            closed_form=lambda chosen_returns, rejected_returns: torch.tensor(0.0, dtype=torch.float64),
-            visible=True,
-            draws=1,
-        ),
-        Case(
-            "a gap of -1000: a loss of 1000",
-            _choice_gaps(-1000.0),
-            closed_form=lambda chosen_returns, rejected_returns: torch.tensor(1000.0, dtype=torch.float64),
-            visible=True,
-            draws=1,
-        ),
+        Case("a gap of +1000: nothing to learn", _choice_gaps(1000.0), closed_form=number(0.0), visible=True, draws=1),
+        Case("a gap of -1000: a loss of 1000", _choice_gaps(-1000.0), closed_form=number(1000.0), visible=True, draws=1),
         Case("gaps of ±30", _choice_gaps(30.0, -30.0, 30.0), closed_form=_loss_by_hand, draws=1),
         Case("large returns, small gaps", _choices(level=2000.0), closed_form=_loss_by_hand, visible=True, draws=1),
         Case("both inputs require gradient", _choices(), differentiate=_CHOICE, visible=True, draws=1),
@@ -486,112 +418,21 @@ BRADLEY_TERRY_LOSS = Exercise(
         *_shape_cases(_CHOICE, _choices()),
     ),
     misconceptions=(
-        Misconception(
-            "sign-missing",
-            _loss_of_gap(lambda x: F.logsigmoid(x).mean()),
-            "This is the log-likelihood, which is to be made large: a loss is minus that.",
-        ),
-        Misconception(
-            "order-reversed",
-            _loss_of_gap(lambda x: -F.logsigmoid(-x).mean()),
-            "It rewards the model for disliking what was chosen: the gap is chosen minus rejected.",
-        ),
-        Misconception(
-            "sum-instead-of-mean",
-            _loss_of_gap(lambda x: -F.logsigmoid(x).sum()),
-            "A sum grows with the batch, and with it the step: take the mean over the pairs.",
-        ),
-        Misconception(
-            "not-averaged", _loss_of_gap(lambda x: -F.logsigmoid(x)), "One loss for each pair comes back: take their mean."
-        ),
-        Misconception(
-            "overflow",
-            _loss_of_gap(lambda x: -torch.sigmoid(x).log().mean()),
-            "Where the model is very wrong this is infinite and its gradient NaN: sigmoid(-1000) is 0, and its logarithm "
-            "-inf (likewise log(1 + exp(1000))). F.logsigmoid takes both in one step.",
-        ),
-        Misconception(
-            "exponentials-divided",
-            _choice(lambda c, r: -(c.exp() / (c.exp() + r.exp())).log().mean()),
-            "exp of a return of 1000 is infinite and the quotient NaN: form the difference of the returns first.",
-        ),
-        Misconception(
-            "probability-clamped",
-            _loss_of_gap(lambda x: -torch.sigmoid(x).clamp(min=1e-8).log().mean()),
-            "A probability kept away from 0 (by clamp or + 1e-8) caps the loss and stops the gradient just where the model "
-            "is most wrong. F.logsigmoid needs no such help.",
-        ),
-        Misconception(
-            "gap-clipped",
-            _loss_of_gap(lambda x: -F.logsigmoid(x.clamp(-20, 20)).mean()),
-            "Clipping the gap caps the loss and stops the gradient just where the model is most wrong.",
-        ),
-        Misconception(
-            "no-gradient-at-zero",
-            _loss_of_gap(lambda x: (torch.relu(-x) + torch.log1p(torch.exp(-x.abs()))).mean()),
-            "The values are right, but at a gap of exactly 0 both relu and abs have gradient 0 in PyTorch: a model that starts "
-            "with equal returns never moves. F.softplus(-x) or F.logsigmoid(x) are right there.",
-        ),
-        Misconception(
-            "probability-not-its-logarithm",
-            _loss_of_gap(lambda x: (1 - torch.sigmoid(x)).mean()),
-            "This is the expected number of mistakes. The likelihood's logarithm punishes confident mistakes much more.",
-        ),
-        Misconception(
-            "hinge",
-            _loss_of_gap(lambda x: torch.relu(1 - x).mean()),
-            "This is a hinge loss, which asks for a margin of 1 and then stops. Bradley-Terry never quite stops.",
-        ),
-        Misconception(
-            "share-of-mistakes",
-            _loss_of_gap(lambda x: (x < 0).to(x.dtype).mean()),
-            "Counting mistakes passes no gradient: use the log-likelihood.",
-        ),
-        Misconception(
-            "segments-scored-apart",
-            _choice(lambda c, r: -(F.logsigmoid(c) + F.logsigmoid(-r)).mean()),
-            "This classifies each segment as good or bad. A comparison says nothing of the level: only the gap may enter.",
-        ),
-        Misconception(
-            "mean-of-gaps-first",
-            _loss_of_gap(lambda x: -F.logsigmoid(x.mean())),
-            "The mean comes last: the average gap hides the pairs that the model has wrong.",
-        ),
-        Misconception(
-            "mean-of-probabilities-first",
-            _loss_of_gap(lambda x: -torch.sigmoid(x).mean().log()),
-            "Independent choices multiply: take each pair's logarithm, then the mean.",
-        ),
-        Misconception(
-            "base-two",
-            _loss_of_gap(lambda x: -F.logsigmoid(x).mean() / math.log(2)),
-            "This is in bits: use the natural logarithm.",
-        ),
-        Misconception(
-            "rejected-detached",
-            _choice(lambda c, r: -F.logsigmoid(c - r.detach()).mean()),
-            "Both segments were scored by the model that learns: the rejected returns need their gradient, too.",
-        ),
-        Misconception(
-            "chosen-detached",
-            _choice(lambda c, r: -F.logsigmoid(c.detach() - r).mean()),
-            "Both segments were scored by the model that learns: the chosen returns need their gradient, too.",
-        ),
-        *_spoilt(ch80.bradley_terry_loss),
-        Misconception("python-float", _after(ch80.bradley_terry_loss, torch.Tensor.item), _SCALAR),
-        Misconception("returns-changed-in-place", _choice(_choice_in_place(ch80.bradley_terry_loss)), _IN_PLACE),
-        Misconception("bad-input-accepted", _choice(_sum_or_all_pairs, checked=False), _VALIDATE),
+        *wrong(_WRONG_BRADLEY_TERRY_LOSS, _choice),
+        cut_from_graph(ch80.bradley_terry_loss),
+        dtype_lost(ch80.bradley_terry_loss),
+        python_float(ch80.bradley_terry_loss),
+        in_place(ch80.bradley_terry_loss, "chosen_returns"),
+        bad_input_accepted(_choice(_sum_or_all_pairs, checked=False)),
     ),
     variants={
-        "softplus of the negated gap": _choice_variant(lambda c, r: F.softplus(r - c).mean()),
-        "binary cross-entropy with logits": _choice_variant(
-            lambda c, r: F.binary_cross_entropy_with_logits(c - r, torch.ones_like(c))
-        ),
-        "cross-entropy of two logits": _choice_variant(
+        "softplus of the negated gap": _choice(lambda c, r: F.softplus(r - c).mean()),
+        "binary cross-entropy with logits": _choice(lambda c, r: F.binary_cross_entropy_with_logits(c - r, torch.ones_like(c))),
+        "cross-entropy of two logits": _choice(
             lambda c, r: F.cross_entropy(torch.stack([c, r], dim=1), torch.zeros(len(c), dtype=torch.int64))
         ),
-        "log-sum-exp": _choice_variant(lambda c, r: (torch.logaddexp(c, r) - c).mean()),
-        "pair by pair, in double precision": _choice_variant(lambda c, r: _by_pairs(c.double(), r.double()).to(c.dtype)),
+        "log-sum-exp": _choice(lambda c, r: (torch.logaddexp(c, r) - c).mean()),
+        "pair by pair, in double precision": _choice(lambda c, r: _by_pairs(c.double(), r.double()).to(c.dtype)),
     },
 )
 
@@ -611,6 +452,36 @@ def _both_positive_and_negative(generator):
     return {name: torch.cat([drawn[name], more]) for name, more in zip(_CHOICE, (extra, other), strict=True)}
 
 
+_WRONG_PREFERENCE_ACCURACY = {
+    "order-reversed": (
+        lambda c, r: (c < r).to(c.dtype).mean(),
+        "This counts the mistakes: the chosen segment should have the larger return.",
+    ),
+    "count-instead-of-share": (lambda c, r: (c > r).to(c.dtype).sum(), "A count grows with the batch: take the mean."),
+    "percent": (lambda c, r: 100 * (c > r).to(c.dtype).mean(), "Return a share between 0 and 1, not per cent."),
+    "mean-sign": (
+        lambda c, r: (c - r).sign().mean(),
+        "The mean sign runs from -1 to 1: a coin would score 0 instead of one half.",
+    ),
+    "mean-probability": (
+        lambda c, r: torch.sigmoid(c - r).mean().detach(),
+        "This is how sure the model is, not how often it is right: compare, then take the mean.",
+    ),
+    "chosen-positive": (
+        lambda c, r: (c > 0).to(c.dtype).mean(),
+        "The sign of a return means nothing, its level is arbitrary: compare the two of a pair.",
+    ),
+    "all-or-nothing": (lambda c, r: (c > r).all().to(c.dtype), "One miss spoils it all here: take the mean."),
+    "means-compared": (
+        lambda c, r: (c.mean() > r.mean()).to(c.dtype),
+        "The averages are compared: compare pair by pair, then take the mean.",
+    ),
+    "all-pairs-compared": (
+        lambda c, r: (c[:, None] > r).to(c.dtype).mean(),
+        "Every chosen segment is compared with every rejected one: only those of one pair were ever compared.",
+    ),
+}
+
 PREFERENCE_ACCURACY = Exercise(
     name="preference_accuracy",
     reference=ch80.preference_accuracy,
@@ -627,92 +498,27 @@ PREFERENCE_ACCURACY = Exercise(
         *_shape_cases(_CHOICE, _choices()),
     ),
     misconceptions=(
+        *wrong(_WRONG_PREFERENCE_ACCURACY, _choice),
+        dtype_lost(ch80.preference_accuracy),
+        Misconception("graph-kept", _choice(lambda c, r: (c > r).to(c.dtype).mean() + 0 * (c - r).sum()), METRIC),
         Misconception(
-            "order-reversed",
-            _choice(lambda c, r: (c < r).to(c.dtype).mean()),
-            "This counts the mistakes: the chosen segment should have the larger return.",
+            "python-float", after(ch80.preference_accuracy, torch.Tensor.item), "Return a 0-dim tensor, not a Python float."
         ),
-        Misconception(
-            "count-instead-of-share",
-            _choice(lambda c, r: (c > r).to(c.dtype).sum()),
-            "A count grows with the batch: take the mean.",
-        ),
-        Misconception(
-            "percent", _choice(lambda c, r: 100 * (c > r).to(c.dtype).mean()), "Return a share between 0 and 1, not per cent."
-        ),
-        Misconception(
-            "mean-sign",
-            _choice(lambda c, r: (c - r).sign().mean()),
-            "The mean sign runs from -1 to 1: a coin would score 0 instead of one half.",
-        ),
-        Misconception(
-            "mean-probability",
-            _choice(lambda c, r: torch.sigmoid(c - r).mean().detach()),
-            "This is how sure the model is, not how often it is right: compare, then take the mean.",
-        ),
-        Misconception(
-            "chosen-positive",
-            _choice(lambda c, r: (c > 0).to(c.dtype).mean()),
-            "The sign of a return means nothing, its level is arbitrary: compare the two of a pair.",
-        ),
-        Misconception(
-            "all-or-nothing", _choice(lambda c, r: (c > r).all().to(c.dtype)), "One miss spoils it all here: take the mean."
-        ),
-        Misconception(
-            "means-compared",
-            _choice(lambda c, r: (c.mean() > r.mean()).to(c.dtype)),
-            "The averages are compared: compare pair by pair, then take the mean.",
-        ),
-        Misconception(
-            "all-pairs-compared",
-            _choice(lambda c, r: (c[:, None] > r).to(c.dtype).mean()),
-            "Every chosen segment is compared with every rejected one: only those of one pair were ever compared.",
-        ),
-        Misconception("dtype-lost", _after(ch80.preference_accuracy, torch.Tensor.float), _DTYPE),
-        Misconception(
-            "graph-kept",
-            _choice(lambda c, r: (c > r).to(c.dtype).mean() + 0 * (c - r).sum()),
-            "A reported metric carries no graph: detach it.",
-        ),
-        Misconception(
-            "python-float", _after(ch80.preference_accuracy, torch.Tensor.item), "Return a 0-dim tensor, not a Python float."
-        ),
-        Misconception("returns-changed-in-place", _choice(_choice_in_place(ch80.preference_accuracy)), _IN_PLACE),
-        Misconception(
-            "bad-input-accepted",
-            _choice(lambda c, r: (c[: len(r) if len(r) > 1 else None] > r).to(c.dtype).mean(), checked=False),
-            _VALIDATE,
-        ),
+        in_place(ch80.preference_accuracy, "chosen_returns"),
+        bad_input_accepted(_choice(lambda c, r: (c[: len(r) if len(r) > 1 else None] > r).to(c.dtype).mean(), checked=False)),
     ),
     variants={
-        "one number at a time": _choice_variant(_counted),
-        "sign of the gap": _choice_variant(lambda c, r: (c - r).detach().sign().clamp(min=0).mean()),
-        "one minus the mistakes": _choice_variant(lambda c, r: 1 - torch.le(c, r).to(c.dtype).mean()),
-        "count_nonzero": _choice_variant(lambda c, r: torch.count_nonzero(c > r).to(c.dtype) / c.numel()),
-        "NumPy": _choice_variant(lambda c, r: torch.tensor(np.mean(c.detach().numpy() > r.detach().numpy()), dtype=c.dtype)),
+        "one number at a time": _choice(_counted),
+        "sign of the gap": _choice(lambda c, r: (c - r).detach().sign().clamp(min=0).mean()),
+        "one minus the mistakes": _choice(lambda c, r: 1 - torch.le(c, r).to(c.dtype).mean()),
+        "count_nonzero": _choice(lambda c, r: torch.count_nonzero(c > r).to(c.dtype) / c.numel()),
+        "NumPy": _choice(lambda c, r: torch.tensor(np.mean(c.detach().numpy() > r.detach().numpy()), dtype=c.dtype)),
     },
 )
 
 # ------------------------------------------------------------------------------------------- standardize_rewards
 
-
-def _standardised(formula, checked=True):
-    """A version; `formula` takes rewards, mask and eps."""
-
-    def version(rewards, mask, eps=1e-8):
-        if checked:
-            validate.same_shape(rewards=rewards, mask=mask)
-        return formula(rewards, mask, eps)
-
-    return version
-
-
-def _standardised_variant(formula):
-    def variant(rewards, mask, eps=1e-8):
-        _refuse(rewards=rewards, mask=mask)
-        return formula(rewards, mask, eps)
-
-    return variant
+_standardised = versions_of(ch80.standardize_rewards, one_shape(*_STEPS))
 
 
 def _scaled(r, m, mean, deviation, eps):
@@ -726,7 +532,7 @@ def _per_axis(axis):
         deviation = (((r - mean) * m).square().sum(axis, keepdim=True) / count).sqrt()
         return _scaled(r, m, mean, deviation, eps)
 
-    return _standardised(formula)
+    return formula
 
 
 def _standardised_by_sums(r, m, eps):
@@ -757,13 +563,6 @@ def _standardised_numpy(r, m, eps):
     return torch.from_numpy(((kept - kept.mean()) / (kept.std() + eps)).filled(0.0)).to(r.dtype)
 
 
-def _standardised_in_place(r, m, eps):
-    result = ch80.standardize_rewards(r, m, eps)
-    with torch.no_grad():
-        r -= r[m].mean()
-    return result
-
-
 def _biased(r, m, eps):
     """The other right answer: the biased deviation."""
     return _scaled(r, m, r[m].mean(), r[m].std(unbiased=False), eps)
@@ -772,6 +571,54 @@ def _biased(r, m, eps):
 def _all_equal_zero(rewards, mask):
     return torch.zeros_like(rewards)
 
+
+_WRONG_STANDARDIZE_REWARDS = {
+    "mask-ignored-in-statistics": (
+        lambda r, m, eps: _scaled(r, m, r.mean(), r.std(), eps),
+        "The padding shifts mean and deviation: take both over the kept steps only, rewards[mask].",
+    ),
+    "padding-counted-as-zeros": (
+        lambda r, m, eps: _scaled(r, m, (r * m).mean(), (r * m).std(), eps),
+        "Padding set to 0 still counts as a reward of 0 in mean and deviation: take both over rewards[mask].",
+    ),
+    "padding-not-zeroed": (
+        lambda r, m, eps: (r - r[m].mean()) / (r[m].std() + eps),
+        "The statistics are right, but the padding comes back with numbers in it: it must be 0.",
+    ),
+    "standardised-per-segment": (
+        _per_axis(1),
+        "Each segment is standardised for itself, so that all have return 0 and nothing is left to compare: take the "
+        "statistics over all kept steps of the batch.",
+    ),
+    "standardised-per-step": (
+        _per_axis(0),
+        "Each time step is standardised for itself: take the statistics over all kept steps of the batch.",
+    ),
+    "mean-not-subtracted": (
+        lambda r, m, eps: _scaled(r, m, 0, r[m].std(), eps),
+        "The level is still there: subtract the mean over the kept steps.",
+    ),
+    "deviation-not-divided": (
+        lambda r, m, eps: _scaled(r, m, r[m].mean(), 1, 0),
+        "Centred, but still in the model's unit: divide by the standard deviation.",
+    ),
+    "variance-instead-of-deviation": (
+        lambda r, m, eps: _scaled(r, m, r[m].mean(), r[m].var(), eps),
+        "The divisor is the variance: take its square root.",
+    ),
+    "scaled-to-unit-range": (
+        lambda r, m, eps: _scaled(r, m, r[m].min(), r[m].max() - r[m].min(), eps),
+        "This maps to [0, 1]: use mean and standard deviation.",
+    ),
+    "eps-missing": (
+        lambda r, m, eps: _scaled(r, m, r[m].mean(), r[m].std(), 0),
+        "When all rewards are equal this is 0 / 0: eps belongs in the denominator.",
+    ),
+    "kept-steps-only": (
+        lambda r, m, eps: (r[m] - r[m].mean()) / (r[m].std() + eps),
+        "rewards[mask] is flat: put the numbers back into their places, (B, T), with 0 in the padding.",
+    ),
+}
 
 STANDARDIZE_REWARDS = Exercise(
     name="standardize_rewards",
@@ -787,82 +634,26 @@ STANDARDIZE_REWARDS = Exercise(
         Case("a segment without steps", _empty_segment, visible=True),
         Case("all rewards equal: zero everywhere", _equal_rewards, closed_form=_all_equal_zero, visible=True),
         Case("single precision", _segments(), dtype=torch.float32, visible=True),
-        Case("mask of one row", _reshaped("mask", lambda m: m[:1], _segments()), raises=_STEPS, visible=True, draws=1),
-        Case("mask with a step too few", _reshaped("mask", lambda m: m[:, 1:], _segments()), raises=_STEPS, draws=1),
+        Case("mask of one row", reshaped(_segments(), "mask", lambda m: m[:1]), raises=_STEPS, visible=True, draws=1),
+        Case("mask with a step too few", reshaped(_segments(), "mask", lambda m: m[:, 1:]), raises=_STEPS, draws=1),
     ),
     misconceptions=(
-        Misconception(
-            "mask-ignored-in-statistics",
-            _standardised(lambda r, m, eps: _scaled(r, m, r.mean(), r.std(), eps)),
-            "The padding shifts mean and deviation: take both over the kept steps only, rewards[mask].",
-        ),
-        Misconception(
-            "padding-counted-as-zeros",
-            _standardised(lambda r, m, eps: _scaled(r, m, (r * m).mean(), (r * m).std(), eps)),
-            "Padding set to 0 still counts as a reward of 0 in mean and deviation: take both over rewards[mask].",
-        ),
-        Misconception(
-            "padding-not-zeroed",
-            _standardised(lambda r, m, eps: (r - r[m].mean()) / (r[m].std() + eps)),
-            "The statistics are right, but the padding comes back with numbers in it: it must be 0.",
-        ),
-        Misconception(
-            "standardised-per-segment",
-            _per_axis(1),
-            "Each segment is standardised for itself, so that all have return 0 and nothing is left to compare: take the "
-            "statistics over all kept steps of the batch.",
-        ),
-        Misconception(
-            "standardised-per-step",
-            _per_axis(0),
-            "Each time step is standardised for itself: take the statistics over all kept steps of the batch.",
-        ),
-        Misconception(
-            "mean-not-subtracted",
-            _standardised(lambda r, m, eps: _scaled(r, m, 0, r[m].std(), eps)),
-            "The level is still there: subtract the mean over the kept steps.",
-        ),
-        Misconception(
-            "deviation-not-divided",
-            _standardised(lambda r, m, eps: _scaled(r, m, r[m].mean(), 1, 0)),
-            "Centred, but still in the model's unit: divide by the standard deviation.",
-        ),
-        Misconception(
-            "variance-instead-of-deviation",
-            _standardised(lambda r, m, eps: _scaled(r, m, r[m].mean(), r[m].var(), eps)),
-            "The divisor is the variance: take its square root.",
-        ),
-        Misconception(
-            "scaled-to-unit-range",
-            _standardised(lambda r, m, eps: _scaled(r, m, r[m].min(), r[m].max() - r[m].min(), eps)),
-            "This maps to [0, 1]: use mean and standard deviation.",
-        ),
-        Misconception(
-            "eps-missing",
-            _standardised(lambda r, m, eps: _scaled(r, m, r[m].mean(), r[m].std(), 0)),
-            "When all rewards are equal this is 0 / 0: eps belongs in the denominator.",
-        ),
-        Misconception(
-            "kept-steps-only",
-            _standardised(lambda r, m, eps: (r[m] - r[m].mean()) / (r[m].std() + eps)),
-            "rewards[mask] is flat: put the numbers back into their places, (B, T), with 0 in the padding.",
-        ),
-        Misconception("dtype-lost", _after(ch80.standardize_rewards, torch.Tensor.float), _DTYPE),
-        Misconception("rewards-changed-in-place", _standardised(_standardised_in_place), _IN_PLACE),
-        Misconception(
-            "bad-input-accepted",
+        *wrong(_WRONG_STANDARDIZE_REWARDS, _standardised),
+        dtype_lost(ch80.standardize_rewards),
+        in_place(ch80.standardize_rewards, "rewards"),
+        bad_input_accepted(
             _standardised(
                 lambda r, m, eps: ch80.standardize_rewards(r[:, -m.shape[1] :], m.expand(len(r), -1), eps), checked=False
             ),
-            "A mask of one row or column broadcasts silently over all segments: compare the shapes first.",
+            _ONE_MASK_FOR_ALL,
         ),
     ),
     variants={
-        "sums written out, biased deviation": _standardised_variant(_standardised_by_sums),
-        "one number at a time": _standardised_variant(_standardised_in_python),
-        "scattered back into zeros": _standardised_variant(_standardised_scatter),
-        "NumPy's masked arrays": _standardised_variant(_standardised_numpy),
-        "torch.where, in double precision": _standardised_variant(
+        "sums written out, biased deviation": _standardised(_standardised_by_sums),
+        "one number at a time": _standardised(_standardised_in_python),
+        "scattered back into zeros": _standardised(_standardised_scatter),
+        "NumPy's masked arrays": _standardised(_standardised_numpy),
+        "torch.where, in double precision": _standardised(
             lambda r, m, eps: torch.where(
                 m, (r.double() - r[m].double().mean()) / (r[m].double().std() + eps), torch.zeros((), dtype=torch.float64)
             ).to(r.dtype)
@@ -882,7 +673,7 @@ def _groups(*gaps, temperature=1.0, level=0.0):
     """Many pairs for each of these gaps, so that frequencies can be told apart."""
 
     def inputs(generator):
-        returns = level + torch.randint(-4, 5, (len(gaps),), generator=generator).double()
+        returns = level + integers(generator, -4, 5, len(gaps)).double()
         ahead = returns + torch.tensor(gaps, dtype=torch.float64)
         seed = int(torch.randint(2**31, (), generator=generator))
         return {
@@ -899,7 +690,7 @@ def _few(**changes):
     """A handful of pairs, which are enough for errors and for answers that are certain."""
 
     def inputs(generator):
-        drawn = {name: 3 * _normal(generator, 5) for name in _ANSWERS}
+        drawn = {name: 3 * normal(generator, 5) for name in _ANSWERS}
         return drawn | {"temperature": 1.0, "generator": built("seeding.generator", seed=1)} | changes
 
     return inputs
@@ -914,26 +705,7 @@ def _certain(generator):
     )(generator)
 
 
-def _answers(formula, checked=True):
-    """A version of the simulated person; `formula` takes a, b, temperature and generator."""
-
-    def version(true_returns_a, true_returns_b, temperature, generator):
-        if checked:
-            validate.same_shape(true_returns_a=true_returns_a, true_returns_b=true_returns_b)
-            validate.positive(temperature=temperature)
-        return formula(true_returns_a, true_returns_b, temperature, generator)
-
-    return version
-
-
-def _answers_variant(formula):
-    def variant(true_returns_a, true_returns_b, temperature, generator):
-        _refuse(true_returns_a=true_returns_a, true_returns_b=true_returns_b)
-        if temperature <= 0:
-            raise ValueError(f"expected temperature > 0, but received {temperature!r}")
-        return formula(true_returns_a, true_returns_b, temperature, generator)
-
-    return variant
+_answers = versions_of(ch80.simulate_preferences, one_shape(*_ANSWERS), satisfies(lambda temperature: temperature > 0))
 
 
 def _uniform(x, generator):
@@ -955,17 +727,58 @@ def _by_numpy(a, b, t, g):
     return torch.from_numpy(rng.random(len(a)) < probability)
 
 
-def _answers_in_place(a, b, t, g):
-    result = ch80.simulate_preferences(a, b, t, g)
-    a.sub_(b)
-    return result
-
-
 def _five_certain(true_returns_a, true_returns_b, temperature, generator):
     return torch.tensor([True, False, True, False, False])
 
 
 _FREQUENCIES: dict[str, Any] = {"view": "group_frequencies", "atol": _SPREAD}
+
+_WRONG_SIMULATE_PREFERENCES = {
+    "temperature-ignored": (
+        _with_probability(lambda a, b, t: torch.sigmoid(a - b)),
+        "The person is as sure as at temperature 1, whatever the argument says: divide the gap by the temperature.",
+    ),
+    "temperature-multiplied": (
+        _with_probability(lambda a, b, t: torch.sigmoid((a - b) * t)),
+        "A hot person errs more, not less: divide the gap by the temperature.",
+    ),
+    "order-reversed": (
+        _with_probability(lambda a, b, t: torch.sigmoid((b - a) / t)),
+        "True should mean that a is preferred, which is likelier the better a is.",
+    ),
+    "never-mistaken": (
+        lambda a, b, t, g: (_uniform(a, g) < 2) & (a > b),
+        "The better segment always wins here, as when the probability is rounded: compare it with a random number, one for each pair.",
+    ),
+    "mistakes-whatever-the-gap": (
+        lambda a, b, t, g: (a > b) ^ (_uniform(a, g) < 0.1),
+        "One answer in ten is flipped, however clear the case: mistakes must grow rare as the gap grows.",
+    ),
+    "one-draw-for-all": (
+        lambda a, b, t, g: torch.rand((), generator=g, dtype=a.dtype) < torch.sigmoid((a - b) / t),
+        "All pairs share one random number, so that equal gaps get equal answers: draw one for each pair.",
+    ),
+    "normal-noise": (
+        lambda a, b, t, g: a - b + t * torch.randn(a.shape, generator=g, dtype=a.dtype) > 0,
+        "Normal noise on the gap gives Thurstone's model. The sigmoid is the distribution of logistic noise.",
+    ),
+    "uniform-noise": (
+        lambda a, b, t, g: a - b + t * (2 * _uniform(a, g) - 1) > 0,
+        "Uniform noise on the gap gives probabilities on a straight line that ends at a gap of one temperature; the sigmoid never ends.",
+    ),
+    "generator-ignored": (
+        lambda a, b, t, g: torch.rand_like(a) < torch.sigmoid((a - b) / t),
+        "The answers come from another source of randomness, so a seed does not fix them: pass generator=generator.",
+    ),
+    "seeded-inside": (
+        lambda a, b, t, g: _uniform(a, torch.Generator().manual_seed(0)) < torch.sigmoid((a - b) / t),
+        "A seed inside the function gives the same answers at every call: draw from the generator that is handed in.",
+    ),
+    "probabilities-returned": (
+        lambda a, b, t, g: torch.sigmoid((a - b) / t) + 0 * _uniform(a, g),
+        "These are the probabilities: draw the answers, as a bool tensor.",
+    ),
+}
 
 SIMULATE_PREFERENCES = Exercise(
     name="simulate_preferences",
@@ -986,65 +799,9 @@ SIMULATE_PREFERENCES = Exercise(
         *_shape_cases(_ANSWERS, _few()),
     ),
     misconceptions=(
-        Misconception(
-            "temperature-ignored",
-            _answers(_with_probability(lambda a, b, t: torch.sigmoid(a - b))),
-            "The person is as sure as at temperature 1, whatever the argument says: divide the gap by the temperature.",
-        ),
-        Misconception(
-            "temperature-multiplied",
-            _answers(_with_probability(lambda a, b, t: torch.sigmoid((a - b) * t))),
-            "A hot person errs more, not less: divide the gap by the temperature.",
-        ),
-        Misconception(
-            "order-reversed",
-            _answers(_with_probability(lambda a, b, t: torch.sigmoid((b - a) / t))),
-            "True should mean that a is preferred, which is likelier the better a is.",
-        ),
-        Misconception(
-            "never-mistaken",
-            _answers(lambda a, b, t, g: (_uniform(a, g) < 2) & (a > b)),
-            "The better segment always wins here, as when the probability is rounded: compare it with a random number, one for each pair.",
-        ),
-        Misconception(
-            "mistakes-whatever-the-gap",
-            _answers(lambda a, b, t, g: (a > b) ^ (_uniform(a, g) < 0.1)),
-            "One answer in ten is flipped, however clear the case: mistakes must grow rare as the gap grows.",
-        ),
-        Misconception(
-            "one-draw-for-all",
-            _answers(lambda a, b, t, g: torch.rand((), generator=g, dtype=a.dtype) < torch.sigmoid((a - b) / t)),
-            "All pairs share one random number, so that equal gaps get equal answers: draw one for each pair.",
-        ),
-        Misconception(
-            "normal-noise",
-            _answers(lambda a, b, t, g: a - b + t * torch.randn(a.shape, generator=g, dtype=a.dtype) > 0),
-            "Normal noise on the gap gives Thurstone's model. The sigmoid is the distribution of logistic noise.",
-        ),
-        Misconception(
-            "uniform-noise",
-            _answers(lambda a, b, t, g: a - b + t * (2 * _uniform(a, g) - 1) > 0),
-            "Uniform noise on the gap gives probabilities on a straight line that ends at a gap of one temperature; the sigmoid "
-            "never ends.",
-        ),
-        Misconception(
-            "generator-ignored",
-            _answers(lambda a, b, t, g: torch.rand_like(a) < torch.sigmoid((a - b) / t)),
-            "The answers come from another source of randomness, so a seed does not fix them: pass generator=generator.",
-        ),
-        Misconception(
-            "seeded-inside",
-            _answers(lambda a, b, t, g: _uniform(a, torch.Generator().manual_seed(0)) < torch.sigmoid((a - b) / t)),
-            "A seed inside the function gives the same answers at every call: draw from the generator that is handed in.",
-        ),
-        Misconception(
-            "probabilities-returned",
-            _answers(lambda a, b, t, g: torch.sigmoid((a - b) / t) + 0 * _uniform(a, g)),
-            "These are the probabilities: draw the answers, as a bool tensor.",
-        ),
-        Misconception("returns-changed-in-place", _answers(_answers_in_place), _IN_PLACE),
-        Misconception(
-            "bad-input-accepted",
+        *wrong(_WRONG_SIMULATE_PREFERENCES, _answers),
+        in_place(ch80.simulate_preferences, "true_returns_a"),
+        bad_input_accepted(
             _answers(
                 lambda a, b, t, g: (
                     _uniform(a, g) < torch.sigmoid((a - b[: None if len(b) == 1 else len(a)]) / t)
@@ -1057,13 +814,13 @@ SIMULATE_PREFERENCES = Exercise(
         ),
     ),
     variants={
-        "torch.bernoulli": _answers_variant(lambda a, b, t, g: torch.bernoulli(torch.sigmoid((a - b) / t), generator=g).bool()),
-        "logistic noise on the gap": _answers_variant(lambda a, b, t, g: a - b + t * _uniform(a, g).logit(eps=1e-12) > 0),
-        "Gumbel noise on both returns": _answers_variant(lambda a, b, t, g: a / t + _gumbel(a, g) > b / t + _gumbel(b, g)),
-        "a drawn index": _answers_variant(
+        "torch.bernoulli": _answers(lambda a, b, t, g: torch.bernoulli(torch.sigmoid((a - b) / t), generator=g).bool()),
+        "logistic noise on the gap": _answers(lambda a, b, t, g: a - b + t * _uniform(a, g).logit(eps=1e-12) > 0),
+        "Gumbel noise on both returns": _answers(lambda a, b, t, g: a / t + _gumbel(a, g) > b / t + _gumbel(b, g)),
+        "a drawn index": _answers(
             lambda a, b, t, g: torch.multinomial((torch.stack([a, b], 1) / t).softmax(1), 1, generator=g)[:, 0] == 0
         ),
-        "NumPy, seeded from the generator": _answers_variant(_by_numpy),
+        "NumPy, seeded from the generator": _answers(_by_numpy),
     },
 )
 
@@ -1078,27 +835,19 @@ def _clips(batch=6, steps=9, full=False, zeros=False, front=False):
     def inputs(generator):
         drawn = _segments(batch, steps, full)(generator)
         mask = drawn["mask"].flip(1) if front else drawn["mask"]
-        obs = _normal(generator, batch, steps, 3)
+        obs = normal(generator, batch, steps, 3)
         model = built(
             "control.clips.QuadraticReward",
-            linear=_normal(generator, 3),
-            quadratic=_normal(generator, 3),
-            bias=1 + torch.rand(1, generator=generator, dtype=torch.float64),
+            linear=normal(generator, 3),
+            quadratic=normal(generator, 3),
+            bias=1 + uniform(generator, 1),
         )
         return {"reward_model": model, "obs": obs * mask.unsqueeze(-1) if zeros else obs, "mask": mask}
 
     return inputs
 
 
-def _learned(formula, checked=True):
-    """A version of the repair; `formula` takes the model, obs and mask."""
-
-    def version(reward_model, obs, mask):
-        if checked and obs.shape[:-1] != mask.shape:
-            raise ValueError(f"obs and mask must agree, got obs {tuple(obs.shape)}, mask {tuple(mask.shape)}")
-        return formula(reward_model, obs, mask)
-
-    return version
+_learned = versions_of(ch80.repaired_segment_returns, satisfies(lambda obs, mask: obs.shape[:-1] == mask.shape))
 
 
 def _learned_step_by_step(model, obs, mask):
@@ -1120,16 +869,35 @@ def _learned_minus_padding(model, obs, mask):
     return model(zeroed).sum(1) - (~mask).sum(1) * model(torch.zeros_like(obs[0, 0]))
 
 
-def _learned_in_place(model, obs, mask):
-    returns = ch80.repaired_segment_returns(model, obs, mask)
-    with torch.no_grad():
-        obs[~mask] = 0
-    return returns
-
-
-def _observation_reshaped(change):
-    return _reshaped("mask", change, _clips())
-
+_WRONG_REPAIRED_SEGMENT_RETURNS = {
+    "observations-masked": (
+        lambda f, o, m: f(o * m.unsqueeze(-1)).sum(1),
+        "This is the suspect program's own bug. What reward does a model with biases give for an observation of zeros, and "
+        "how often is that added up in a short clip?",
+    ),
+    "mask-ignored": (lambda f, o, m: f(o).sum(1), "The padding is scored and added as well: use the mask."),
+    "mask-inverted": (lambda f, o, m: (f(o) * ~m).sum(1), "This adds up the padding: True marks the steps to keep."),
+    "mean-instead-of-sum": (
+        lambda f, o, m: (f(o) * m).sum(1) / m.sum(1),
+        "The length of a clip is forgotten, and it is what these comparisons are about: sum, do not average.",
+    ),
+    "mean-over-padded-length": (
+        lambda f, o, m: (f(o) * m).mean(1),
+        "Dividing by the padded length changes the unit of the returns: sum, do not average.",
+    ),
+    "observations-masked-and-averaged": (
+        lambda f, o, m: f(o * m.unsqueeze(-1)).sum(1) / m.sum(1),
+        "The padding still enters, as an observation of zeros, and the sum has become a mean: mask the rewards, then sum.",
+    ),
+    "model-of-the-sum": (
+        lambda f, o, m: f((o * m.unsqueeze(-1)).sum(1)),
+        "The reward of a sum of observations is not the sum of their rewards: score each step first.",
+    ),
+    "rewards-per-step": (
+        lambda f, o, m: f(o).masked_fill(~m, 0),
+        "These are the rewards, (B, T), rightly masked: a clip's return is their sum.",
+    ),
+}
 
 REPAIRED_SEGMENT_RETURNS = Exercise(
     name="repaired_segment_returns",
@@ -1145,53 +913,15 @@ REPAIRED_SEGMENT_RETURNS = Exercise(
         Case("observations that require gradient", _clips(), differentiate=["obs"], visible=True),
         Case("gradient with padding of zeros", _clips(zeros=True), differentiate=["obs"]),
         Case("single precision", _clips(), dtype=torch.float32, visible=True),
-        Case("mask of one row", _observation_reshaped(lambda m: m[:1]), raises=_LAB, visible=True, draws=1),
-        Case("mask of one column", _observation_reshaped(lambda m: m[:, :1]), raises=_LAB, draws=1),
+        Case("mask of one row", reshaped(_clips(), "mask", lambda m: m[:1]), raises=_LAB, visible=True, draws=1),
+        Case("mask of one column", reshaped(_clips(), "mask", lambda m: m[:, :1]), raises=_LAB, draws=1),
     ),
     misconceptions=(
-        Misconception(
-            "observations-masked",
-            _learned(lambda f, o, m: f(o * m.unsqueeze(-1)).sum(1)),
-            "This is the suspect program's own bug. What reward does a model with biases give for an observation of zeros, and "
-            "how often is that added up in a short clip?",
-        ),
-        Misconception(
-            "mask-ignored", _learned(lambda f, o, m: f(o).sum(1)), "The padding is scored and added as well: use the mask."
-        ),
-        Misconception(
-            "mask-inverted",
-            _learned(lambda f, o, m: (f(o) * ~m).sum(1)),
-            "This adds up the padding: True marks the steps to keep.",
-        ),
-        Misconception(
-            "mean-instead-of-sum",
-            _learned(lambda f, o, m: (f(o) * m).sum(1) / m.sum(1)),
-            "The length of a clip is forgotten, and it is what these comparisons are about: sum, do not average.",
-        ),
-        Misconception(
-            "mean-over-padded-length",
-            _learned(lambda f, o, m: (f(o) * m).mean(1)),
-            "Dividing by the padded length changes the unit of the returns: sum, do not average.",
-        ),
-        Misconception(
-            "observations-masked-and-averaged",
-            _learned(lambda f, o, m: f(o * m.unsqueeze(-1)).sum(1) / m.sum(1)),
-            "The padding still enters, as an observation of zeros, and the sum has become a mean: mask the rewards, then sum.",
-        ),
-        Misconception(
-            "model-of-the-sum",
-            _learned(lambda f, o, m: f((o * m.unsqueeze(-1)).sum(1))),
-            "The reward of a sum of observations is not the sum of their rewards: score each step first.",
-        ),
-        Misconception(
-            "rewards-per-step",
-            _learned(lambda f, o, m: f(o).masked_fill(~m, 0)),
-            "These are the rewards, (B, T), rightly masked: a clip's return is their sum.",
-        ),
-        *_spoilt(ch80.repaired_segment_returns),
-        Misconception("observations-changed-in-place", _learned(_learned_in_place), _IN_PLACE),
-        Misconception(
-            "bad-input-accepted",
+        *wrong(_WRONG_REPAIRED_SEGMENT_RETURNS, _learned),
+        cut_from_graph(ch80.repaired_segment_returns),
+        dtype_lost(ch80.repaired_segment_returns),
+        in_place(ch80.repaired_segment_returns, "obs", 1),
+        bad_input_accepted(
             _learned(lambda f, o, m: f(o).masked_fill(~m, 0).sum(1), checked=False),
             "A mask of one row or column broadcasts silently over all clips: compare the shapes first.",
         ),
