@@ -2,54 +2,41 @@
 
 from __future__ import annotations
 
-import functools
 import math
 
 import numpy as np
 import torch
 from torch.nn import functional as F
 
-from autograder.authoring import spec
-from autograder.authoring.spec import Exercise, Misconception
-from course_lib import validate
+from autograder.authoring.parts import (
+    DTYPE,
+    bad_input_accepted,
+    dtype_lost,
+    integers,
+    normal,
+    number,
+    one_shape,
+    python_float,
+    reshaped,
+    satisfies,
+    uniform,
+    versions_of,
+    wrong,
+)
+from autograder.authoring.spec import Case, Exercise, Misconception
 from course_lib.checks.cases import built
 from course_lib.control.demonstrations import Demonstrations
 from solutions import ch74
 
-Case = functools.partial(spec.Case)  # one hidden draw of each: episodes and training runs cost time
-
 # ---------------------------------------------------------------------------------------------------------------- inputs
-
-
-def _normal(generator, *shape):
-    return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
 
 def _integer(generator, high):
     return int(torch.randint(high, (), generator=generator))
 
 
-def _with(inputs, **changes):
-    return lambda generator: inputs(generator) | changes
-
-
-def _changed(name, change, inputs):
-    def wrong(generator):
-        drawn = inputs(generator)
-        return drawn | {name: change(drawn[name])}
-
-    return wrong
-
-
-def _after(function, change):
-    """Right, and then spoilt."""
-    return lambda *args, **kwargs: change(function(*args, **kwargs))
-
-
 # ------------------------------------------------------------------------------------------------------ common messages
 
-_DTYPE = "The result has lost the inputs' dtype: no .float(), and no NumPy in between."
-_SCALAR = "Return a 0-dim tensor, not a Python float: .item() cuts the graph that the optimiser needs."
 _SIGN = "This is the log-likelihood, to be made large; a loss is to be made small: negate it."
 _SUM = "A sum grows with the batch, and with it the step: take the mean over the batch."
 _DETACHED = "The loss reaches no parameter: detach only what is data, never the policy's outputs."
@@ -89,18 +76,16 @@ def _driver(**settings):
 
 def _strong(generator):
     """Commands far beyond ±1, that lead off the road at once."""
-    return built("control.road.LinearPolicy", weights=_normal(generator, 1, 5), bias=torch.full((1,), 3.0, dtype=torch.float64))
+    return built("control.road.LinearPolicy", weights=normal(generator, 1, 5), bias=torch.full((1,), 3.0, dtype=torch.float64))
 
 
 def _weak(generator):
     """Hardly any command: the rover leaves the road where it bends, sooner or later."""
-    return built(
-        "control.road.LinearPolicy", weights=0.05 * _normal(generator, 1, 5), bias=0.6 + 0.1 * _normal(generator, 1).abs()
-    )
+    return built("control.road.LinearPolicy", weights=0.05 * normal(generator, 1, 5), bias=0.6 + 0.1 * normal(generator, 1).abs())
 
 
 def _three_commands(generator):
-    return built("control.road.LinearPolicy", weights=_normal(generator, 3, 5), bias=0.1 * _normal(generator, 3), discrete=True)
+    return built("control.road.LinearPolicy", weights=normal(generator, 3, 5), bias=0.1 * normal(generator, 3), discrete=True)
 
 
 _ROAD = built("control.road.RoadEnv", time_limit=4, gust=0.05, start=0.7)
@@ -122,13 +107,10 @@ def _roll(
     carry=False,
     count_last=True,
     keep_last=True,
-    checked=True,
     no_graph=torch.no_grad,
     tensor=lambda obs: torch.tensor(obs, dtype=torch.float32),
 ):
     """The loop of both exercises, with a place for each mistake: rows (obs, action), episode ids, returns, lengths."""
-    if checked:
-        validate.at_least_one(num_episodes=num_episodes)
     rows, ids, returns, lengths, total = [], [], [], [], 0.0
     for episode in range(num_episodes):
         obs, _ = reset(env, seed, episode)
@@ -150,7 +132,10 @@ def _roll(
     return rows, torch.tensor(ids), torch.tensor(returns), torch.tensor(lengths)
 
 
-def _demonstrations(change=lambda demonstrations, lengths: demonstrations, **mistake):
+_rolled = versions_of(ch74.collect_demonstrations, satisfies(lambda num_episodes: num_episodes >= 1))
+
+
+def _demonstrations(change=lambda demonstrations, lengths: demonstrations, checked=True, **mistake):
     """A version of the exercise: `mistake` goes to the loop, `change` is made to its result."""
 
     def version(policy, env, num_episodes, seed):
@@ -158,7 +143,7 @@ def _demonstrations(change=lambda demonstrations, lengths: demonstrations, **mis
         obs, actions = (torch.stack(column) for column in zip(*rows, strict=True))
         return change(Demonstrations(obs, actions, ids, returns), lengths)
 
-    return version
+    return _rolled(version, checked)
 
 
 def _replaced(**changes):
@@ -183,8 +168,6 @@ def _with_last_obs(policy, env, num_episodes, seed):
 
 
 def _from_whole_episodes(policy, env, num_episodes, seed):
-    if num_episodes < 1:
-        raise ValueError(f"expected num_episodes >= 1, received {num_episodes}")
     episodes = []
     for k in range(num_episodes):
         obs, actions, rewards = [env.reset(seed=seed + k)[0].copy()], [], []
@@ -207,8 +190,6 @@ def _from_whole_episodes(policy, env, num_episodes, seed):
 
 
 def _in_numpy(policy, env, num_episodes, seed):
-    if not num_episodes >= 1:
-        raise ValueError(f"num_episodes: {num_episodes} is not at least 1")
     table, returns = [], np.zeros(num_episodes, dtype=np.float32)
     for k in range(num_episodes):
         obs, terminated, truncated = env.reset(seed=seed + k)[0], False, False
@@ -223,8 +204,6 @@ def _in_numpy(policy, env, num_episodes, seed):
 
 def _one_step_at_a_time(policy, env, num_episodes, seed):
     """A single loop over steps, that resets in between."""
-    if num_episodes <= 0:
-        raise ValueError(f"num_episodes = {num_episodes}")
     episode, rewards = 0, [0.0]
     columns: dict[str, list] = {"obs": [], "actions": [], "episode_ids": []}
     obs = env.reset(seed=seed)[0]
@@ -246,6 +225,53 @@ _ONLY_LAST = "The rows of the last step are missing: write a step down before yo
 
 _GRAPH_KEPT = "The actions carry the expert's graph, the whole network with them: call the policy under torch.no_grad()."
 
+_WRONG_COLLECT_DEMONSTRATIONS = {
+    "obs-not-copied": (
+        _demonstrations(tensor=torch.from_numpy),
+        "The environment fills one array anew at every step, and all rows of an episode are its last observation: copy what you keep;"
+        " torch.tensor copies, torch.from_numpy and torch.as_tensor do not.",
+    ),
+    "obs-after-the-action": (
+        _demonstrations(row=lambda before, action, after: (after, action)),
+        "Each row pairs an action with the observation that it led to: pair it with the one that the expert had seen.",
+    ),
+    "last-obs-included": (
+        _rolled(_with_last_obs),
+        "There are more observations than actions: to the last one of an episode nobody answered. Leave it out.",
+    ),
+    "last-step-missing": (_demonstrations(keep_last=False), _ONLY_LAST),
+    "actions-clipped": (
+        _demonstrations(_replaced(actions=lambda seen, _: seen.actions.clamp(-1, 1) if seen.actions.ndim > 1 else seen.actions)),
+        "Write the actions down as the policy returned them; what the environment makes of them is its own affair.",
+    ),
+    "same-seed-each-episode": (_demonstrations(reset=lambda env, seed, _: env.reset(seed=seed)), _SAME_SEED),
+    "seeded-once": (_demonstrations(reset=lambda env, seed, episode: env.reset(seed=None if episode else seed)), _SEEDED_ONCE),
+    "truncation-ignored": (_demonstrations(ended=lambda terminated, _: terminated), _TRUNCATED),
+    "termination-ignored": (_demonstrations(ended=lambda _, truncated: truncated), _TERMINATED),
+    "ids-from-one": (
+        _demonstrations(_replaced(episode_ids=lambda seen, _: seen.episode_ids + 1)),
+        "Episodes are numbered from 0.",
+    ),
+    "steps-numbered": (
+        _demonstrations(_replaced(episode_ids=lambda seen, _: torch.arange(len(seen.obs)))),
+        "episode_ids numbers the steps: all steps of one episode share one number.",
+    ),
+    "returns-discounted": (_demonstrations(gamma=0.99), _DISCOUNT),
+    "returns-added-up": (_demonstrations(carry=True), _ADDED_UP),
+    "last-reward-missing": (_demonstrations(count_last=False), _LAST_REWARD),
+    "lengths-for-returns": (_demonstrations(_replaced(returns=lambda _, lengths: lengths)), _LENGTHS),
+    "batch-axis-missing": (_demonstrations(call=lambda policy, obs: policy(obs)), _BATCH),
+    "batch-axis-kept": (
+        _demonstrations(_replaced(obs=lambda seen, _: seen.obs.unsqueeze(1), actions=lambda seen, _: seen.actions.unsqueeze(1))),
+        "Each row still has the axis of its batch of one: take the row out with [0] or squeeze(0), or join rows with torch.cat.",
+    ),
+    "graph-kept": (_demonstrations(no_graph=torch.enable_grad), _GRAPH_KEPT),
+    "dtype-lost": (
+        _demonstrations(_replaced(obs=lambda seen, _: seen.obs.double(), returns=lambda seen, _: seen.returns.double())),
+        "Observations and returns are to be float32, as networks take them; NumPy's own numbers are float64.",
+    ),
+}
+
 COLLECT_DEMONSTRATIONS = Exercise(
     name="collect_demonstrations",
     reference=ch74.collect_demonstrations,
@@ -261,76 +287,13 @@ COLLECT_DEMONSTRATIONS = Exercise(
         Case("num_episodes = 0", _drive(_ROAD, _driver(), num_episodes=0), raises=["num_episodes"], visible=True),
     ),
     misconceptions=(
-        Misconception(
-            "obs-not-copied",
-            _demonstrations(tensor=torch.from_numpy),
-            "The environment fills one array anew at every step, and all rows of an episode are its last observation: copy what you keep;"
-            " torch.tensor copies, torch.from_numpy and torch.as_tensor do not.",
-        ),
-        Misconception(
-            "obs-after-the-action",
-            _demonstrations(row=lambda before, action, after: (after, action)),
-            "Each row pairs an action with the observation that it led to: pair it with the one that the expert had seen.",
-        ),
-        Misconception(
-            "last-obs-included",
-            _with_last_obs,
-            "There are more observations than actions: to the last one of an episode nobody answered. Leave it out.",
-        ),
-        Misconception("last-step-missing", _demonstrations(keep_last=False), _ONLY_LAST),
-        Misconception(
-            "actions-clipped",
-            _demonstrations(
-                _replaced(actions=lambda seen, _: seen.actions.clamp(-1, 1) if seen.actions.ndim > 1 else seen.actions)
-            ),
-            "Write the actions down as the policy returned them; what the environment makes of them is its own affair.",
-        ),
-        Misconception("same-seed-each-episode", _demonstrations(reset=lambda env, seed, _: env.reset(seed=seed)), _SAME_SEED),
-        Misconception(
-            "seeded-once",
-            _demonstrations(reset=lambda env, seed, episode: env.reset(seed=None if episode else seed)),
-            _SEEDED_ONCE,
-        ),
-        Misconception("truncation-ignored", _demonstrations(ended=lambda terminated, _: terminated), _TRUNCATED),
-        Misconception("termination-ignored", _demonstrations(ended=lambda _, truncated: truncated), _TERMINATED),
-        Misconception(
-            "ids-from-one",
-            _demonstrations(_replaced(episode_ids=lambda seen, _: seen.episode_ids + 1)),
-            "Episodes are numbered from 0.",
-        ),
-        Misconception(
-            "steps-numbered",
-            _demonstrations(_replaced(episode_ids=lambda seen, _: torch.arange(len(seen.obs)))),
-            "episode_ids numbers the steps: all steps of one episode share one number.",
-        ),
-        Misconception("returns-discounted", _demonstrations(gamma=0.99), _DISCOUNT),
-        Misconception("returns-added-up", _demonstrations(carry=True), _ADDED_UP),
-        Misconception("last-reward-missing", _demonstrations(count_last=False), _LAST_REWARD),
-        Misconception("lengths-for-returns", _demonstrations(_replaced(returns=lambda _, lengths: lengths)), _LENGTHS),
-        Misconception(
-            "batch-axis-missing",
-            _demonstrations(call=lambda policy, obs: policy(obs)),
-            _BATCH,
-        ),
-        Misconception(
-            "batch-axis-kept",
-            _demonstrations(
-                _replaced(obs=lambda seen, _: seen.obs.unsqueeze(1), actions=lambda seen, _: seen.actions.unsqueeze(1))
-            ),
-            "Each row still has the axis of its batch of one: take the row out with [0] or squeeze(0), or join rows with torch.cat.",
-        ),
-        Misconception("graph-kept", _demonstrations(no_graph=torch.enable_grad), _GRAPH_KEPT),
-        Misconception(
-            "dtype-lost",
-            _demonstrations(_replaced(obs=lambda seen, _: seen.obs.double(), returns=lambda seen, _: seen.returns.double())),
-            "Observations and returns are to be float32, as networks take them; NumPy's own numbers are float64.",
-        ),
-        Misconception("bad-input-accepted", _demonstrations(checked=False), _EPISODES),
+        *wrong(_WRONG_COLLECT_DEMONSTRATIONS),
+        bad_input_accepted(_demonstrations(checked=False), _EPISODES),
     ),
     variants={
-        "whole episodes joined": _from_whole_episodes,
-        "rows of arrays": _in_numpy,
-        "one loop over steps": _one_step_at_a_time,
+        "whole episodes joined": _rolled(_from_whole_episodes),
+        "rows of arrays": _rolled(_in_numpy),
+        "one loop over steps": _rolled(_one_step_at_a_time),
         "the loop with its parts": _demonstrations(),
     },
 )
@@ -367,7 +330,7 @@ def _in_turns(_generator):
 
 
 def _uneven(generator):
-    return _steps(torch.randint(2, 30, (40,), generator=generator))
+    return _steps(integers(generator, 2, 30, 40))
 
 
 def _one_giant(generator):
@@ -383,24 +346,22 @@ def _odd_numbers(generator):
     return ids[torch.randperm(len(ids), generator=generator)]
 
 
-def _splits(choose, checked=True):
-    """A version of the exercise: `choose` gives (train, held_out) from ids, fraction and generator."""
-
-    def version(episode_ids, fraction, generator):
-        if checked:
-            validate.unit_interval(fraction=fraction)
-            if len(episode_ids.unique()) < 2:
-                raise ValueError("episode_ids has fewer than two episodes")
-        return choose(episode_ids, fraction, generator)
-
-    return version
+_splits = versions_of(
+    ch74.split_by_episode,
+    satisfies(lambda fraction: 0 <= fraction <= 1),
+    satisfies(lambda episode_ids: len(episode_ids.unique()) > 1),
+)
 
 
 def _count(number, fraction):
     return min(max(round(fraction * number), 1), number - 1)
 
 
-def _held(ids, fraction, generator, count=_count, order=lambda number, generator: torch.randperm(number, generator=generator)):
+def _shuffled(number, generator):
+    return torch.randperm(number, generator=generator)
+
+
+def _held(ids, fraction, generator, count=_count, order=_shuffled):
     episodes = ids.unique()
     chosen = episodes[order(len(episodes), generator)[: count(len(episodes), fraction)]]
     return torch.isin(ids, chosen)
@@ -408,6 +369,11 @@ def _held(ids, fraction, generator, count=_count, order=lambda number, generator
 
 def _sides(held_out):
     return ~held_out, held_out
+
+
+def _drawn(**parts):
+    """Whole episodes on either side, with another `count` or `order`."""
+    return lambda ids, fraction, generator: _sides(_held(ids, fraction, generator, **parts))
 
 
 def _by_steps(ids, fraction, generator):
@@ -457,11 +423,7 @@ def _reseeded(ids, fraction, generator):
 
 
 def _with_a_set(ids, fraction, generator):
-    if not 0 <= fraction <= 1:
-        raise ValueError(f"fraction {fraction} is not a share")
     numbers = sorted(set(ids.tolist()))
-    if len(numbers) < 2:
-        raise ValueError(f"cannot split episode_ids with {len(numbers)} episode")
     keys = torch.rand(len(numbers), generator=generator, dtype=torch.float64).tolist()
     order = [number for _, number in sorted(zip(keys, numbers, strict=True))]
     count = max(1, min(len(numbers) - 1, math.ceil(fraction * len(numbers))))
@@ -471,11 +433,7 @@ def _with_a_set(ids, fraction, generator):
 
 
 def _with_inverse(ids, fraction, generator):
-    if fraction < 0 or fraction > 1:
-        raise ValueError(f"fraction must be a share, got {fraction}")
     episodes, inverse = torch.unique(ids, return_inverse=True)
-    if len(episodes) == 1:
-        raise ValueError("episode_ids: nothing to hold out")
     count = int(fraction * len(episodes))
     count = 1 if count < 1 else count - (count == len(episodes))
     rank = torch.randperm(len(episodes), generator=generator)
@@ -484,14 +442,65 @@ def _with_inverse(ids, fraction, generator):
 
 
 def _with_training_episodes(ids, fraction, generator):
-    if not (0 <= fraction <= 1 and len(ids.unique()) >= 2):
-        raise ValueError(f"fraction {fraction} or episode_ids do not allow a split")
     episodes = ids.unique().numpy()
     picks = np.random.default_rng(int(torch.randint(2**31, (), generator=generator)))
     kept = len(episodes) - _count(len(episodes), fraction)
     train = np.isin(ids.numpy(), picks.choice(episodes, size=kept, replace=False))
     return torch.from_numpy(train), torch.from_numpy(~train)
 
+
+_WRONG_SPLIT_BY_EPISODE = {
+    "split-by-steps": (
+        _by_steps,
+        "Steps are drawn, not episodes: nearly every episode is on both sides, and neighbours in time are near-copies. Draw episodes.",
+    ),
+    "cut-through-an-episode": (
+        _by_cut,
+        "The steps are cut at a position, in their order, and an episode may lie on both sides of the cut. Draw whole episodes.",
+    ),
+    "sides-swapped": (
+        lambda *given: _sides(_held(*given))[::-1],
+        "The masks come in the order train, held_out, and fraction is the share of the held-out side.",
+    ),
+    "held-out-in-training": (
+        lambda ids, *rest: (torch.ones(len(ids), dtype=torch.bool), _held(ids, *rest)),
+        "The held-out steps are trained on as well: the two masks must exclude each other.",
+    ),
+    "a-coin-for-each-episode": (
+        _by_coin,
+        "The number of held-out episodes is left to chance, and may be 0: shuffle the episodes and take a fixed number.",
+    ),
+    "counted-in-steps": (_until_steps, "fraction is a share of the episodes, not of the steps: long and short ones count alike."),
+    "rounded-to-none": (
+        _drawn(count=lambda number, fraction: int(fraction * number)),
+        "With few episodes the count rounds down to 0, and nothing is held out: at least one episode stays on either side.",
+    ),
+    "rounded-to-all": (
+        _drawn(count=lambda number, fraction: max(math.ceil(fraction * number), 1)),
+        "With few episodes the count rounds up to all, and nothing is left to train on: at least one episode stays on either side.",
+    ),
+    "numbers-assumed": (
+        _numbers_assumed,
+        "The episodes are not always numbered 0, 1, 2, …: find out which numbers occur, with episode_ids.unique().",
+    ),
+    "not-shuffled": (
+        _drawn(order=lambda number, _generator: torch.arange(number)),
+        "It is always the same episodes that are held out, the first ones: draw their order from the generator.",
+    ),
+    "global-generator": (
+        _drawn(order=lambda number, _generator: torch.randperm(number)),
+        "The order comes from the global generator: pass generator=generator, so that a seed makes the split again.",
+    ),
+    "reseeded-inside": (
+        _reseeded,
+        "The generator is set back at every call, so every split is the same one: use it as it comes.",
+    ),
+    "indices-returned": (_indices, "Bool masks over the steps are asked for, not indices."),
+    "masks-as-numbers": (
+        lambda *given: tuple(mask.long() for mask in _sides(_held(*given))),
+        "Masks are bool: as numbers, 0 and 1 would be taken for indices.",
+    ),
+}
 
 SPLIT_BY_EPISODE = Exercise(
     name="split_by_episode",
@@ -509,111 +518,23 @@ SPLIT_BY_EPISODE = Exercise(
         Case("five episodes, fraction = 1", _split(_even(5), 1.0), view="episode_split"),
         Case("three episodes, nearly all held out", _split(_even(3), 0.95), view="episode_split"),
         Case("two splits in a row", _split(_even(60, 2), 0.5), repeat=2, view="two_splits", visible=True),
-        Case(
-            "the generator is drawn from",
-            _split(_even(20), 0.3),
-            returns=("generator",),
-            view="drawn_from",
-            visible=True,
-        ),
+        Case("the generator is drawn from", _split(_even(20), 0.3), returns=("generator",), view="drawn_from", visible=True),
         Case("fraction = -0.1", _split(_even(5), -0.1), raises=["fraction"]),
         Case("fraction = 20", _split(_even(5), 20.0), raises=["fraction"], visible=True),
         Case("a single episode", _split(_even(1), 0.5), raises=["episode_ids"]),
     ),
     misconceptions=(
-        Misconception(
-            "split-by-steps",
-            _splits(_by_steps),
-            "Steps are drawn, not episodes: nearly every episode is on both sides, and neighbours in time are near-copies. Draw episodes.",
-        ),
-        Misconception(
-            "cut-through-an-episode",
-            _splits(_by_cut),
-            "The steps are cut at a position, in their order, and an episode may lie on both sides of the cut. Draw whole episodes.",
-        ),
-        Misconception(
-            "sides-swapped",
-            _splits(lambda *given: _sides(_held(*given))[::-1]),
-            "The masks come in the order train, held_out, and fraction is the share of the held-out side.",
-        ),
-        Misconception(
-            "held-out-in-training",
-            _splits(lambda ids, *rest: (torch.ones(len(ids), dtype=torch.bool), _held(ids, *rest))),
-            "The held-out steps are trained on as well: the two masks must exclude each other.",
-        ),
-        Misconception(
-            "a-coin-for-each-episode",
-            _splits(_by_coin),
-            "The number of held-out episodes is left to chance, and may be 0: shuffle the episodes and take a fixed number.",
-        ),
-        Misconception(
-            "counted-in-steps",
-            _splits(_until_steps),
-            "fraction is a share of the episodes, not of the steps: long and short ones count alike.",
-        ),
-        Misconception(
-            "rounded-to-none",
-            _splits(
-                lambda ids, fraction, generator: _sides(
-                    _held(ids, fraction, generator, count=lambda number, fraction: int(fraction * number))
-                )
-            ),
-            "With few episodes the count rounds down to 0, and nothing is held out: at least one episode stays on either side.",
-        ),
-        Misconception(
-            "rounded-to-all",
-            _splits(
-                lambda ids, fraction, generator: _sides(
-                    _held(ids, fraction, generator, count=lambda number, fraction: max(math.ceil(fraction * number), 1))
-                )
-            ),
-            "With few episodes the count rounds up to all, and nothing is left to train on: at least one episode stays on either side.",
-        ),
-        Misconception(
-            "numbers-assumed",
-            _splits(_numbers_assumed),
-            "The episodes are not always numbered 0, 1, 2, …: find out which numbers occur, with episode_ids.unique().",
-        ),
-        Misconception(
-            "not-shuffled",
-            _splits(
-                lambda ids, fraction, generator: _sides(
-                    _held(ids, fraction, generator, order=lambda number, _generator: torch.arange(number))
-                )
-            ),
-            "It is always the same episodes that are held out, the first ones: draw their order from the generator.",
-        ),
-        Misconception(
-            "global-generator",
-            _splits(
-                lambda ids, fraction, generator: _sides(
-                    _held(ids, fraction, generator, order=lambda number, _generator: torch.randperm(number))
-                )
-            ),
-            "The order comes from the global generator: pass generator=generator, so that a seed makes the split again.",
-        ),
-        Misconception(
-            "reseeded-inside",
-            _splits(_reseeded),
-            "The generator is set back at every call, so every split is the same one: use it as it comes.",
-        ),
-        Misconception("indices-returned", _splits(_indices), "Bool masks over the steps are asked for, not indices."),
-        Misconception(
-            "masks-as-numbers",
-            _splits(lambda *given: tuple(mask.long() for mask in _sides(_held(*given)))),
-            "Masks are bool: as numbers, 0 and 1 would be taken for indices.",
-        ),
-        Misconception(
-            "bad-input-accepted",
-            _splits(lambda *given: _sides(_held(*given)), checked=False),
+        *wrong(_WRONG_SPLIT_BY_EPISODE, _splits),
+        bad_input_accepted(
+            _splits(_drawn(), checked=False),
             "A fraction outside [0, 1] is a percentage or a slip, and one episode cannot be split: refuse both.",
         ),
     ),
     variants={
-        "a set of numbers, rounded up": _with_a_set,
-        "ranks of the episodes, rounded down": _with_inverse,
-        "training episodes drawn, by NumPy seeded from the generator": _with_training_episodes,
-        "the reference's way, by parts": _splits(lambda *given: _sides(_held(*given))),
+        "a set of numbers, rounded up": _splits(_with_a_set),
+        "ranks of the episodes, rounded down": _splits(_with_inverse),
+        "training episodes drawn, by NumPy seeded from the generator": _splits(_with_training_episodes),
+        "the reference's way, by parts": _splits(_drawn()),
     },
 )
 
@@ -623,8 +544,8 @@ SPLIT_BY_EPISODE = Exercise(
 def _choices(size=24, actions=4, spread=1.5):
     def inputs(generator):
         return {
-            "logits": spread * _normal(generator, size, actions),
-            "expert_actions": torch.randint(actions, (size,), generator=generator),
+            "logits": spread * normal(generator, size, actions),
+            "expert_actions": integers(generator, 0, actions, size),
         }
 
     return inputs
@@ -637,13 +558,11 @@ def _right_by_far(generator):
     return drawn
 
 
-def _discrete(loss, checked=True):
-    def version(logits, expert_actions):
-        if checked and (logits.ndim != 2 or expert_actions.shape != logits.shape[:1]):
-            raise ValueError("logits must be (B, A) and expert_actions (B,)")
-        return loss(logits, expert_actions)
-
-    return version
+_DISCRETE = ("logits", "expert_actions")
+_discrete = versions_of(
+    ch74.behavioural_cloning_loss,
+    satisfies(lambda logits, expert_actions: logits.ndim == 2 and expert_actions.shape == logits.shape[:1]),
+)
 
 
 def _of_expert(x, actions):
@@ -666,6 +585,52 @@ _LOGITS_SHAPES = (
     "logits must be (B, A) with one expert action for each row, (B,): a column of actions fails late or, worse, not at all."
 )
 
+_WRONG_BEHAVIOURAL_CLONING_LOSS = {
+    "softmax-twice": (
+        lambda x, a: F.cross_entropy(x.softmax(-1), a),
+        "cross_entropy applies the softmax itself: hand it the logits, or the loss can never come near 0.",
+    ),
+    "softmax-missing": (
+        lambda x, a: F.nll_loss(x, a),
+        "nll_loss takes log-probabilities, and these are logits: use cross_entropy, or log_softmax first.",
+    ),
+    "log-of-softmax": (
+        lambda x, a: -_of_expert(x.softmax(-1).log(), a).mean(),
+        "softmax underflows to 0 for an action that the policy finds impossible, and its log is -inf: use log_softmax.",
+    ),
+    "softmax-over-the-batch": (
+        lambda x, a: -_of_expert(x.log_softmax(0), a).mean(),
+        "The softmax runs over the batch: actions are the last axis.",
+    ),
+    "sign-missing": (lambda x, a: -F.cross_entropy(x, a), _SIGN),
+    "sum-instead-of-mean": (lambda x, a: F.cross_entropy(x, a, reduction="sum"), _SUM),
+    "per-step-losses": (
+        lambda x, a: F.cross_entropy(x, a, reduction="none"),
+        "One number is asked for: take the mean over the batch.",
+    ),
+    "mean-over-actions": (
+        lambda x, a: -(F.one_hot(a, x.shape[1]) * x.log_softmax(-1)).mean(),
+        "The mean also runs over the actions, and divides by A once too often: sum over them, then take the mean over the batch.",
+    ),
+    "one-minus-probability": (
+        lambda x, a: 1 - _of_expert(x.softmax(-1), a).mean(),
+        "This is a mean probability: the likelihood of independent steps is a product, whose logarithm adds log-probabilities.",
+    ),
+    "squared-error": (
+        lambda x, a: (x.softmax(-1) - F.one_hot(a, x.shape[1])).square().sum(-1).mean(),
+        "This is a squared error against the one-hot action: the loss is the cross-entropy.",
+    ),
+    "label-smoothing": (
+        lambda x, a: F.cross_entropy(x, a, label_smoothing=0.1),
+        "The labels are smoothed: the expert's action counts in full.",
+    ),
+    "bits-for-nats": (
+        lambda x, a: F.cross_entropy(x, a) / math.log(2),
+        "The logarithm is natural in this course: nats, not bits.",
+    ),
+    "logits-detached": (lambda x, a: F.cross_entropy(x.detach(), a), _DETACHED),
+}
+
 BEHAVIOURAL_CLONING_LOSS = Exercise(
     name="behavioural_cloning_loss",
     reference=ch74.behavioural_cloning_loss,
@@ -673,85 +638,24 @@ BEHAVIOURAL_CLONING_LOSS = Exercise(
     cases=(
         Case("four actions", _choices(), closed_form=_by_hand, visible=True, draws=3),
         Case("two actions", _choices(10, 2), closed_form=_by_hand),
-        Case(
-            "no preference: log A",
-            lambda generator: _choices(8, 6, 0.0)(generator),
-            closed_form=lambda logits, _: torch.tensor(math.log(6), dtype=torch.float64),
-            visible=True,
-        ),
+        Case("no preference: log A", _choices(8, 6, 0.0), closed_form=number(math.log(6)), visible=True),
         Case("logits around 900", _right_by_far, closed_form=_by_hand, visible=True),
         Case("logits that require gradient", _choices(7, 3), differentiate=["logits"], visible=True),
         Case("gradient of logits around 900", _right_by_far, differentiate=["logits"]),
         Case("single precision", _choices(), dtype=torch.float32, visible=True),
         Case(
             "expert_actions as a column",
-            _changed("expert_actions", lambda a: a[:, None], _choices()),
-            raises=["logits", "expert_actions"],
+            reshaped(_choices(), "expert_actions", lambda a: a[:, None]),
+            raises=_DISCRETE,
             visible=True,
         ),
-        Case(
-            "an expert action too few",
-            _changed("expert_actions", lambda a: a[:-1], _choices()),
-            raises=["logits", "expert_actions"],
-        ),
+        Case("an expert action too few", reshaped(_choices(), "expert_actions", lambda a: a[:-1]), raises=_DISCRETE),
     ),
     misconceptions=(
-        Misconception(
-            "softmax-twice",
-            _discrete(lambda x, a: F.cross_entropy(x.softmax(-1), a)),
-            "cross_entropy applies the softmax itself: hand it the logits, or the loss can never come near 0.",
-        ),
-        Misconception(
-            "softmax-missing",
-            _discrete(lambda x, a: F.nll_loss(x, a)),
-            "nll_loss takes log-probabilities, and these are logits: use cross_entropy, or log_softmax first.",
-        ),
-        Misconception(
-            "log-of-softmax",
-            _discrete(lambda x, a: -_of_expert(x.softmax(-1).log(), a).mean()),
-            "softmax underflows to 0 for an action that the policy finds impossible, and its log is -inf: use log_softmax.",
-        ),
-        Misconception(
-            "softmax-over-the-batch",
-            _discrete(lambda x, a: -_of_expert(x.log_softmax(0), a).mean()),
-            "The softmax runs over the batch: actions are the last axis.",
-        ),
-        Misconception("sign-missing", _discrete(lambda x, a: -F.cross_entropy(x, a)), _SIGN),
-        Misconception("sum-instead-of-mean", _discrete(lambda x, a: F.cross_entropy(x, a, reduction="sum")), _SUM),
-        Misconception(
-            "per-step-losses",
-            _discrete(lambda x, a: F.cross_entropy(x, a, reduction="none")),
-            "One number is asked for: take the mean over the batch.",
-        ),
-        Misconception(
-            "mean-over-actions",
-            _discrete(lambda x, a: -(F.one_hot(a, x.shape[1]) * x.log_softmax(-1)).mean()),
-            "The mean also runs over the actions, and divides by A once too often: sum over them, then take the mean over the batch.",
-        ),
-        Misconception(
-            "one-minus-probability",
-            _discrete(lambda x, a: 1 - _of_expert(x.softmax(-1), a).mean()),
-            "This is a mean probability: the likelihood of independent steps is a product, whose logarithm adds log-probabilities.",
-        ),
-        Misconception(
-            "squared-error",
-            _discrete(lambda x, a: (x.softmax(-1) - F.one_hot(a, x.shape[1])).square().sum(-1).mean()),
-            "This is a squared error against the one-hot action: the loss is the cross-entropy.",
-        ),
-        Misconception(
-            "label-smoothing",
-            _discrete(lambda x, a: F.cross_entropy(x, a, label_smoothing=0.1)),
-            "The labels are smoothed: the expert's action counts in full.",
-        ),
-        Misconception(
-            "bits-for-nats",
-            _discrete(lambda x, a: F.cross_entropy(x, a) / math.log(2)),
-            "The logarithm is natural in this course: nats, not bits.",
-        ),
-        Misconception("logits-detached", _discrete(lambda x, a: F.cross_entropy(x.detach(), a)), _DETACHED),
-        Misconception("python-float", _after(ch74.behavioural_cloning_loss, torch.Tensor.item), _SCALAR),
-        Misconception("dtype-lost", _after(ch74.behavioural_cloning_loss, torch.Tensor.float), _DTYPE),
-        Misconception("bad-input-accepted", _discrete(_unchecked_discrete, checked=False), _LOGITS_SHAPES),
+        *wrong(_WRONG_BEHAVIOURAL_CLONING_LOSS, _discrete),
+        python_float(ch74.behavioural_cloning_loss),
+        dtype_lost(ch74.behavioural_cloning_loss),
+        bad_input_accepted(_discrete(_unchecked_discrete, checked=False), _LOGITS_SHAPES),
     ),
     variants={
         "log_softmax and gather": _discrete(lambda x, a: -_of_expert(x.log_softmax(-1), a).mean()),
@@ -767,16 +671,20 @@ BEHAVIOURAL_CLONING_LOSS = Exercise(
 
 # -------------------------------------------------------------------------------------------------- gaussian_cloning_loss
 
+_HALF_LOG_TWO_PI = math.log(2 * math.pi) / 2
+_PAIR = ("mean", "expert_actions")
+_GAUSSIAN = ("mean", "log_std", "expert_actions")
+
 
 def _continuous(size=11, actions=3, per_state=False, log_std=-0.5, spread=0.8):
     def inputs(generator):
-        mean = _normal(generator, size, actions)
+        mean = normal(generator, size, actions)
         shape = (size, actions) if per_state else (actions,)
-        log_stds = log_std + 0.4 * _normal(generator, *shape)
+        log_stds = log_std + 0.4 * normal(generator, *shape)
         return {
             "mean": mean,
             "log_std": log_stds,
-            "expert_actions": mean + spread * log_stds.exp() * _normal(generator, size, actions),
+            "expert_actions": mean + spread * log_stds.exp() * normal(generator, size, actions),
         }
 
     return inputs
@@ -784,25 +692,20 @@ def _continuous(size=11, actions=3, per_state=False, log_std=-0.5, spread=0.8):
 
 def _perfect(generator):
     """The mean is what the expert did, and σ is 1: only the constant is left."""
-    mean = _normal(generator, 6, 2)
+    mean = normal(generator, 6, 2)
     return {"mean": mean, "log_std": torch.zeros(2, dtype=torch.float64), "expert_actions": mean}
 
 
 def _surprise(mean, log_std, actions):
-    return ((actions - mean) / log_std.exp()).square() / 2 + log_std + math.log(2 * math.pi) / 2
+    return ((actions - mean) / log_std.exp()).square() / 2 + log_std + _HALF_LOG_TWO_PI
 
 
-def _gaussian(loss, checked=True, leak=False):
-    """A version of the loss: `loss` takes mean, log_std and actions; `leak` lets gradient into the actions."""
-
-    def version(mean, log_std, expert_actions):
-        if checked:
-            validate.same_shape(mean=mean, expert_actions=expert_actions)
-            if log_std.shape not in (mean.shape, mean.shape[1:]):
-                raise ValueError("log_std must be (A,) or (B, A)")
-        return loss(mean, log_std, expert_actions if leak else expert_actions.detach())
-
-    return version
+_gaussian = versions_of(
+    ch74.gaussian_cloning_loss,
+    one_shape(*_PAIR),
+    satisfies(lambda log_std, mean: log_std.shape in (mean.shape, mean.shape[1:])),
+    data=["expert_actions"],
+)
 
 
 def _gaussian_by_hand(mean, log_std, expert_actions):
@@ -824,8 +727,57 @@ def _multivariate(mean, log_std, actions):
     return -torch.distributions.MultivariateNormal(mean, scale_tril=scale).log_prob(actions).mean()
 
 
-_PAIR = ("mean", "expert_actions")
 _GAUSSIAN_SHAPES = "Shapes that differ broadcast silently, (B, 1) against (B, A) or a row against all rows: compare them first."
+
+_WRONG_GAUSSIAN_CLONING_LOSS = {
+    "log-std-taken-as-std": (
+        lambda m, s, a: ((a - m) / s).square().div(2).add(s.abs().log()).add(_HALF_LOG_TWO_PI).sum(-1).mean(),
+        "log_std is the logarithm of σ: σ = log_std.exp().",
+    ),
+    "log-std-taken-as-log-variance": (
+        lambda m, s, a: _surprise(m, s / 2, a).sum(-1).mean(),
+        "log_std is log σ, not log σ²: the square is σ² = exp(2 log_std), and log σ enters without a half.",
+    ),
+    "divided-by-std-once": (
+        lambda m, s, a: ((a - m).square() / s.exp() / 2 + s + _HALF_LOG_TWO_PI).sum(-1).mean(),
+        "The squared error is divided by σ: divide by σ², or divide the error by σ before squaring.",
+    ),
+    "log-std-missing": (
+        lambda m, s, a: (_surprise(m, s, a) - s).sum(-1).mean(),
+        "The term log σ is missing: without it a large σ costs nothing, and training makes it ever larger.",
+    ),
+    "constant-missing": (
+        lambda m, s, a: (_surprise(m, s, a) - _HALF_LOG_TWO_PI).sum(-1).mean(),
+        "½ log 2π per action is missing. It changes no gradient, but the number is no longer a log-likelihood in nats.",
+    ),
+    "constant-once": (
+        lambda m, s, a: (_surprise(m, s, a) - _HALF_LOG_TWO_PI).sum(-1).mean() + _HALF_LOG_TWO_PI,
+        "½ log 2π belongs to every action component, and counts A times.",
+    ),
+    "half-missing": (
+        lambda m, s, a: (_surprise(m, s, a) + ((a - m) / s.exp()).square() / 2).sum(-1).mean(),
+        "The ½ before the squared error is missing.",
+    ),
+    "mean-over-actions": (
+        lambda m, s, a: _surprise(m, s, a).mean(),
+        "Components of one action are independent, so their log-likelihoods add up: sum over A, mean over B.",
+    ),
+    "sum-over-batch": (lambda m, s, a: _surprise(m, s, a).sum(), _SUM),
+    "per-step-losses": (lambda m, s, a: _surprise(m, s, a).sum(-1), "One number is asked for: take the mean over B."),
+    "sign-missing": (lambda m, s, a: -_surprise(m, s, a).sum(-1).mean(), _SIGN),
+    "squared-error": (
+        lambda m, s, a: (a - m).square().sum(-1).mean(),
+        "This is the squared error: right up to a factor while σ is fixed, but log_std has no part in it.",
+    ),
+    "log-std-detached": (
+        lambda m, s, a: _surprise(m, s.detach(), a).sum(-1).mean(),
+        "No gradient reaches log_std, so σ is never learned: only the expert's actions are data.",
+    ),
+    "mean-detached": (
+        lambda m, s, a: _surprise(m.detach(), s, a).sum(-1).mean(),
+        "No gradient reaches the mean, which is to learn.",
+    ),
+}
 
 GAUSSIAN_CLONING_LOSS = Exercise(
     name="gaussian_cloning_loss",
@@ -834,111 +786,33 @@ GAUSSIAN_CLONING_LOSS = Exercise(
     cases=(
         Case("three actions, one σ each", _continuous(), closed_form=_gaussian_by_hand, visible=True, draws=3),
         Case("a σ for every state", _continuous(per_state=True), closed_form=_gaussian_by_hand, visible=True),
-        Case(
-            "a perfect clone: A/2 log 2π",
-            _perfect,
-            closed_form=lambda mean, log_std, expert_actions: torch.tensor(math.log(2 * math.pi), dtype=torch.float64),
-            visible=True,
-        ),
+        Case("a perfect clone: A/2 log 2π", _perfect, closed_form=number(math.log(2 * math.pi)), visible=True),
         Case("one action", _continuous(actions=1), closed_form=_gaussian_by_hand),
         Case("as many actions as rows", _continuous(4, 4), closed_form=_gaussian_by_hand),
         Case("σ around e⁻⁸", _continuous(log_std=-8.0), closed_form=_gaussian_by_hand),
         Case("σ around e⁴", _continuous(log_std=4.0), closed_form=_gaussian_by_hand),
-        Case("all inputs require gradient", _continuous(), differentiate=["mean", "log_std", "expert_actions"], visible=True),
-        Case("gradient to a σ for every state", _continuous(per_state=True), differentiate=["mean", "log_std", "expert_actions"]),
+        Case("all inputs require gradient", _continuous(), differentiate=_GAUSSIAN, visible=True),
+        Case("gradient to a σ for every state", _continuous(per_state=True), differentiate=_GAUSSIAN),
         Case("single precision", _continuous(), dtype=torch.float32, visible=True),
         Case(
             "expert_actions with an action too few",
-            _changed("expert_actions", lambda a: a[:, :1], _continuous()),
+            reshaped(_continuous(), "expert_actions", lambda a: a[:, :1]),
             raises=_PAIR,
             visible=True,
         ),
-        Case("expert_actions of a single row", _changed("expert_actions", lambda a: a[0], _continuous()), raises=_PAIR),
-        Case(
-            "log_std as a column",
-            _changed("log_std", lambda s: s[:, :1], _continuous(per_state=True)),
-            raises=["log_std"],
-        ),
+        Case("expert_actions of a single row", reshaped(_continuous(), "expert_actions", lambda a: a[0]), raises=_PAIR),
+        Case("log_std as a column", reshaped(_continuous(per_state=True), "log_std", lambda s: s[:, :1]), raises=["log_std"]),
     ),
     misconceptions=(
-        Misconception(
-            "log-std-taken-as-std",
-            _gaussian(
-                lambda m, s, a: ((a - m) / s).square().div(2).add(s.abs().log()).add(math.log(2 * math.pi) / 2).sum(-1).mean()
-            ),
-            "log_std is the logarithm of σ: σ = log_std.exp().",
-        ),
-        Misconception(
-            "log-std-taken-as-log-variance",
-            _gaussian(lambda m, s, a: _surprise(m, s / 2, a).sum(-1).mean()),
-            "log_std is log σ, not log σ²: the square is σ² = exp(2 log_std), and log σ enters without a half.",
-        ),
-        Misconception(
-            "divided-by-std-once",
-            _gaussian(lambda m, s, a: ((a - m).square() / s.exp() / 2 + s + math.log(2 * math.pi) / 2).sum(-1).mean()),
-            "The squared error is divided by σ: divide by σ², or divide the error by σ before squaring.",
-        ),
-        Misconception(
-            "log-std-missing",
-            _gaussian(lambda m, s, a: (_surprise(m, s, a) - s).sum(-1).mean()),
-            "The term log σ is missing: without it a large σ costs nothing, and training makes it ever larger.",
-        ),
-        Misconception(
-            "constant-missing",
-            _gaussian(lambda m, s, a: (_surprise(m, s, a) - math.log(2 * math.pi) / 2).sum(-1).mean()),
-            "½ log 2π per action is missing. It changes no gradient, but the number is no longer a log-likelihood in nats.",
-        ),
-        Misconception(
-            "constant-once",
-            _gaussian(
-                lambda m, s, a: (_surprise(m, s, a) - math.log(2 * math.pi) / 2).sum(-1).mean() + math.log(2 * math.pi) / 2
-            ),
-            "½ log 2π belongs to every action component, and counts A times.",
-        ),
-        Misconception(
-            "half-missing",
-            _gaussian(lambda m, s, a: (_surprise(m, s, a) + ((a - m) / s.exp()).square() / 2).sum(-1).mean()),
-            "The ½ before the squared error is missing.",
-        ),
-        Misconception(
-            "mean-over-actions",
-            _gaussian(lambda m, s, a: _surprise(m, s, a).mean()),
-            "Components of one action are independent, so their log-likelihoods add up: sum over A, mean over B.",
-        ),
-        Misconception("sum-over-batch", _gaussian(lambda m, s, a: _surprise(m, s, a).sum()), _SUM),
-        Misconception(
-            "per-step-losses",
-            _gaussian(lambda m, s, a: _surprise(m, s, a).sum(-1)),
-            "One number is asked for: take the mean over B.",
-        ),
-        Misconception("sign-missing", _gaussian(lambda m, s, a: -_surprise(m, s, a).sum(-1).mean()), _SIGN),
-        Misconception(
-            "squared-error",
-            _gaussian(lambda m, s, a: (a - m).square().sum(-1).mean()),
-            "This is the squared error: right up to a factor while σ is fixed, but log_std has no part in it.",
-        ),
-        Misconception(
-            "log-std-detached",
-            _gaussian(lambda m, s, a: _surprise(m, s.detach(), a).sum(-1).mean()),
-            "No gradient reaches log_std, so σ is never learned: only the expert's actions are data.",
-        ),
-        Misconception(
-            "mean-detached",
-            _gaussian(lambda m, s, a: _surprise(m.detach(), s, a).sum(-1).mean()),
-            "No gradient reaches the mean, which is to learn.",
-        ),
+        *wrong(_WRONG_GAUSSIAN_CLONING_LOSS, _gaussian),
         Misconception(
             "gradient-into-expert-actions",
             _gaussian(lambda m, s, a: _surprise(m, s, a).sum(-1).mean(), leak=True),
             "The expert's actions are data: detach them.",
         ),
-        Misconception("python-float", _after(ch74.gaussian_cloning_loss, torch.Tensor.item), _SCALAR),
-        Misconception("dtype-lost", _after(ch74.gaussian_cloning_loss, torch.Tensor.float), _DTYPE),
-        Misconception(
-            "bad-input-accepted",
-            _gaussian(lambda m, s, a: _surprise(m, s, a).sum(-1).mean(), checked=False),
-            _GAUSSIAN_SHAPES,
-        ),
+        python_float(ch74.gaussian_cloning_loss),
+        dtype_lost(ch74.gaussian_cloning_loss),
+        bad_input_accepted(_gaussian(lambda m, s, a: _surprise(m, s, a).sum(-1).mean(), checked=False), _GAUSSIAN_SHAPES),
     ),
     variants={
         "a normal distribution": _gaussian(_distribution),
@@ -962,11 +836,11 @@ def _regression(gain=1.0, rows=48, batch_size=48, num_steps=17, noise=0.3):
     """Linear data for a linear network that begins at 0, and squared errors of `gain` times its output."""
 
     def inputs(generator):
-        obs = math.sqrt(12) * (torch.rand(rows, 2, generator=generator, dtype=torch.float64) - 0.5)
+        obs = math.sqrt(12) * (uniform(generator, rows, 2) - 0.5)
         if batch_size == 1:  # each row says something about one of the two weights only
             obs = 1.5 * obs.sign() * F.one_hot(torch.arange(rows) % 2)
-        signs = torch.randint(2, (1, 2), generator=generator) * 2 - 1
-        errors = noise * _normal(generator, rows, 1)
+        signs = integers(generator, 0, 2, 1, 2) * 2 - 1
+        errors = noise * normal(generator, rows, 1)
         return {
             "network": built("control.road.LinearPolicy", weights=torch.zeros(1, 2), bias=torch.zeros(1)),
             "loss_fn": built("control.demonstrations.SquaredError", gain=gain),
@@ -999,6 +873,11 @@ def _descend(network, learning_rate):
         weights.grad = None
 
 
+_training = versions_of(
+    ch74.train_bc, satisfies(lambda num_steps: num_steps >= 1), satisfies(lambda obs, actions: len(obs) == len(actions))
+)
+
+
 def _trained(
     move=_descend,
     loss=lambda loss_fn, outputs, actions: loss_fn(outputs, actions),
@@ -1014,10 +893,7 @@ def _trained(
 ):
     """A version of the training with plain gradient descent: every argument is the place of a mistake."""
 
-    def version(network, loss_fn, obs, actions, num_steps=1000, batch_size=128, learning_rate=3e-3, generator=None):
-        if checked:
-            validate.at_least_one(num_steps=num_steps)
-            validate.same_length(obs=obs, actions=actions)
+    def version(network, loss_fn, obs, actions, num_steps, batch_size, learning_rate, generator):
         network, losses = trained(network), []
         chosen = rows(len(obs), batch_size, generator)
         for step in range(steps(num_steps)):
@@ -1029,19 +905,18 @@ def _trained(
             move(network, rate(learning_rate))
         return result(losses)
 
-    return version
+    return _training(version, checked)
 
 
-def _optimised(make, rows=lambda count, size, generator: torch.randint(count, (size,), generator=generator)):
+def _optimised(make):
     """A correct version with another optimiser and another way to draw a minibatch."""
 
-    def version(network, loss_fn, obs, actions, num_steps=1000, batch_size=128, learning_rate=3e-3, generator=None):
-        if num_steps < 1 or obs.shape[0] != actions.shape[0]:
-            raise ValueError(f"num_steps {num_steps} or the rows of obs and actions, {len(obs)} and {len(actions)}, do not fit")
+    def version(network, loss_fn, obs, actions, num_steps, batch_size, learning_rate, generator):
         optimizer = make(network.parameters(), lr=learning_rate)
         losses = torch.zeros(num_steps)
         for step in range(num_steps):
-            chosen = torch.arange(len(obs)) if batch_size >= len(obs) else rows(len(obs), batch_size, generator)
+            whole = batch_size >= len(obs)
+            chosen = torch.arange(len(obs)) if whole else integers(generator, 0, len(obs), batch_size)
             optimizer.zero_grad()
             loss = loss_fn(network(obs[chosen]), actions[chosen])
             losses[step] = loss.item()
@@ -1049,13 +924,11 @@ def _optimised(make, rows=lambda count, size, generator: torch.randint(count, (s
             optimizer.step()
         return losses
 
-    return version
+    return _training(version)
 
 
-def _in_epochs(network, loss_fn, obs, actions, num_steps=1000, batch_size=128, learning_rate=3e-3, generator=None):
+def _in_epochs(network, loss_fn, obs, actions, num_steps, batch_size, learning_rate, generator):
     """Every row once before any row twice."""
-    validate.at_least_one(num_steps=num_steps)
-    validate.same_length(obs=obs, actions=actions)
     optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate)
     losses: list[torch.Tensor] = []
     while len(losses) < num_steps:
@@ -1078,8 +951,7 @@ def _standing_still(network, _learning_rate):
 
 
 def _copied(network):
-    twin = type(network)(network.weights.detach().clone(), network.bias.detach().clone(), network.discrete)
-    return twin
+    return type(network)(network.weights.detach().clone(), network.bias.detach().clone(), network.discrete)
 
 
 def _least_squares(network, loss_fn, obs, actions, **_settings):
@@ -1090,6 +962,52 @@ def _least_squares(network, loss_fn, obs, actions, **_settings):
 
 
 _NETWORK = ("network",)  # what is looked at after the call
+
+_WRONG_TRAIN_BC = {
+    "gradients-not-cleared": (
+        _trained(_accumulating),
+        "Gradients add up from step to step: call optimizer.zero_grad() before each backward().",
+    ),
+    "no-step": (_trained(_standing_still), "The network never changes: optimizer.step() must follow backward()."),
+    "uphill": (
+        _trained(loss=lambda loss_fn, outputs, actions: -loss_fn(outputs, actions), kept=lambda loss: -loss.detach()),
+        "The loss grows: it is descended, not climbed, and a loss has its minus already.",
+    ),
+    "batch-size-ignored": (
+        _trained(rows=lambda count, _batch_size, generator: torch.randperm(count, generator=generator)),
+        "Each step takes all rows: batch_size says how many a minibatch has.",
+    ),
+    "first-minibatch-only": (_trained(once=True), "The minibatch is drawn once, outside the loop: draw a new one for each step."),
+    "rows-unpaired": (
+        _trained(pair=lambda rows: torch.randperm(len(rows))),
+        "Observations and actions are drawn separately: use the same indices for both, or no action belongs to its observation.",
+    ),
+    "learning-rate-ignored": (_trained(rate=lambda _: 3e-3), "The learning rate is fixed: use the argument learning_rate."),
+    "loss-fn-ignored": (
+        _trained(loss=lambda _loss_fn, outputs, actions: (outputs - actions).square().mean()),
+        "This minimises the squared error whatever the caller asks for: use loss_fn.",
+    ),
+    "copy-trained": (
+        _trained(trained=_copied),
+        "A copy is trained, and the caller's network stays as it was: train the network itself, in place.",
+    ),
+    "epochs-for-steps": (
+        _trained(steps=lambda num_steps: 2 * num_steps),
+        "There are more losses than num_steps: one gradient step counts as one, not one pass over the data.",
+    ),
+    "global-generator": (
+        _trained(rows=lambda count, batch_size, _generator: torch.randperm(count)[:batch_size]),
+        "The minibatches come from the global generator: pass generator=generator.",
+    ),
+    "a-list-of-numbers": (
+        _trained(result=lambda losses: [loss.item() for loss in losses]),
+        "Return a tensor of shape (num_steps,): torch.stack or torch.tensor makes one from the list.",
+    ),
+    "graphs-kept": (
+        _trained(kept=lambda loss: loss),
+        "The losses carry their graphs, and with them every batch's activations: detach them when you write them down.",
+    ),
+}
 
 TRAIN_BC = Exercise(
     name="train_bc",
@@ -1119,75 +1037,14 @@ TRAIN_BC = Exercise(
         Case("num_steps = 0", _regression(num_steps=0), raises=["num_steps"]),
         Case(
             "actions with a row too few",
-            _changed("actions", lambda a: a[:-1], _regression(num_steps=2)),
+            reshaped(_regression(num_steps=2), "actions", lambda a: a[:-1]),
             raises=["obs", "actions"],
             visible=True,
         ),
     ),
     misconceptions=(
-        Misconception(
-            "gradients-not-cleared",
-            _trained(_accumulating),
-            "Gradients add up from step to step: call optimizer.zero_grad() before each backward().",
-        ),
-        Misconception(
-            "no-step", _trained(_standing_still), "The network never changes: optimizer.step() must follow backward()."
-        ),
-        Misconception(
-            "uphill",
-            _trained(loss=lambda loss_fn, outputs, actions: -loss_fn(outputs, actions), kept=lambda loss: -loss.detach()),
-            "The loss grows: it is descended, not climbed, and a loss has its minus already.",
-        ),
-        Misconception(
-            "batch-size-ignored",
-            _trained(rows=lambda count, _batch_size, generator: torch.randperm(count, generator=generator)),
-            "Each step takes all rows: batch_size says how many a minibatch has.",
-        ),
-        Misconception(
-            "first-minibatch-only",
-            _trained(once=True),
-            "The minibatch is drawn once, outside the loop: draw a new one for each step.",
-        ),
-        Misconception(
-            "rows-unpaired",
-            _trained(pair=lambda rows: torch.randperm(len(rows))),
-            "Observations and actions are drawn separately: use the same indices for both, or no action belongs to its observation.",
-        ),
-        Misconception(
-            "learning-rate-ignored", _trained(rate=lambda _: 3e-3), "The learning rate is fixed: use the argument learning_rate."
-        ),
-        Misconception(
-            "loss-fn-ignored",
-            _trained(loss=lambda _loss_fn, outputs, actions: (outputs - actions).square().mean()),
-            "This minimises the squared error whatever the caller asks for: use loss_fn.",
-        ),
-        Misconception(
-            "copy-trained",
-            _trained(trained=_copied),
-            "A copy is trained, and the caller's network stays as it was: train the network itself, in place.",
-        ),
-        Misconception(
-            "epochs-for-steps",
-            _trained(steps=lambda num_steps: 2 * num_steps),
-            "There are more losses than num_steps: one gradient step counts as one, not one pass over the data.",
-        ),
-        Misconception(
-            "global-generator",
-            _trained(rows=lambda count, batch_size, _generator: torch.randperm(count)[:batch_size]),
-            "The minibatches come from the global generator: pass generator=generator.",
-        ),
-        Misconception(
-            "a-list-of-numbers",
-            _trained(result=lambda losses: [loss.item() for loss in losses]),
-            "Return a tensor of shape (num_steps,): torch.stack or torch.tensor makes one from the list.",
-        ),
-        Misconception(
-            "graphs-kept",
-            _trained(kept=lambda loss: loss),
-            "The losses carry their graphs, and with them every batch's activations: detach them when you write them down.",
-        ),
-        Misconception(
-            "bad-input-accepted",
+        *wrong(_WRONG_TRAIN_BC),
+        bad_input_accepted(
             _trained(checked=False, result=lambda losses: torch.stack(losses) if losses else torch.zeros(0)),
             "Rows that do not pair up train on wrong actions where no index is out of range: compare the numbers of rows first.",
         ),
@@ -1198,25 +1055,22 @@ TRAIN_BC = Exercise(
             lambda parameters, lr: torch.optim.SGD(parameters, lr=lr / 2, momentum=0.5, nesterov=True)
         ),
         "AdamW": _optimised(torch.optim.AdamW),
-        "epochs": _in_epochs,
+        "epochs": _training(_in_epochs),
     },
 )
 
 # --------------------------------------------------------------------------------------------------------------- evaluate
 
 
-def _returns(pick=lambda returns, lengths: returns, **mistake):
+def _returns(pick=lambda returns, lengths: returns, checked=True, **mistake):
     def version(policy, env, num_episodes, seed):
         _, _, returns, lengths = _roll(policy, env, num_episodes, seed, **mistake)
         return pick(returns, lengths)
 
-    return version
+    return _rolled(version, checked)
 
 
 def _summed_afterwards(policy, env, num_episodes, seed):
-    if num_episodes < 1:
-        raise ValueError(f"expected num_episodes >= 1, received {num_episodes}")
-
     def rewards(k):
         obs, over = env.reset(seed=seed + k)[0], False
         while not over:
@@ -1228,8 +1082,6 @@ def _summed_afterwards(policy, env, num_episodes, seed):
 
 
 def _in_a_buffer(policy, env, num_episodes, seed):
-    if num_episodes <= 0:
-        raise ValueError(f"num_episodes: {num_episodes}")
     returns = torch.zeros(num_episodes)
     for k in range(num_episodes):
         obs, _ = env.reset(seed=seed + k)
@@ -1242,6 +1094,25 @@ def _in_a_buffer(policy, env, num_episodes, seed):
                 break
     return returns
 
+
+_WRONG_EVALUATE = {
+    "averaged": (_returns(lambda returns, _: returns.mean()), "One return for each episode is asked for, (E,): average later."),
+    "discounted": (_returns(gamma=0.99), _DISCOUNT),
+    "reward-per-step": (_returns(lambda returns, lengths: returns / lengths), "A return is a sum of rewards, not their mean."),
+    "lengths-for-returns": (_returns(lambda _, lengths: lengths), _LENGTHS),
+    "last-reward-missing": (_returns(count_last=False), _LAST_REWARD),
+    "added-up": (_returns(carry=True), _ADDED_UP),
+    "same-seed-each-episode": (_returns(reset=lambda env, seed, _: env.reset(seed=seed)), _SAME_SEED),
+    "seeded-once": (_returns(reset=lambda env, seed, episode: env.reset(seed=None if episode else seed)), _SEEDED_ONCE),
+    "truncation-ignored": (_returns(ended=lambda terminated, _: terminated), _TRUNCATED),
+    "termination-ignored": (_returns(ended=lambda _, truncated: truncated), _TERMINATED),
+    "batch-axis-missing": (_returns(call=lambda policy, obs: policy(obs)), _BATCH),
+    "a-list-of-numbers": (_returns(lambda returns, _: returns.tolist()), "Return a tensor of shape (E,), not a list of numbers."),
+    "dtype-lost": (
+        _returns(lambda returns, _: returns.double()),
+        "The returns are to be float32; NumPy's own numbers are float64.",
+    ),
+}
 
 EVALUATE = Exercise(
     name="evaluate",
@@ -1256,43 +1127,13 @@ EVALUATE = Exercise(
         Case("num_episodes = 0", _drive(_ROAD, _driver(), num_episodes=0), raises=["num_episodes"], visible=True),
     ),
     misconceptions=(
-        Misconception(
-            "averaged",
-            _returns(lambda returns, _: returns.mean()),
-            "One return for each episode is asked for, (E,): average later.",
-        ),
-        Misconception("discounted", _returns(gamma=0.99), _DISCOUNT),
-        Misconception(
-            "reward-per-step",
-            _returns(lambda returns, lengths: returns / lengths),
-            "A return is a sum of rewards, not their mean.",
-        ),
-        Misconception("lengths-for-returns", _returns(lambda _, lengths: lengths), _LENGTHS),
-        Misconception("last-reward-missing", _returns(count_last=False), _LAST_REWARD),
-        Misconception("added-up", _returns(carry=True), _ADDED_UP),
-        Misconception("same-seed-each-episode", _returns(reset=lambda env, seed, _: env.reset(seed=seed)), _SAME_SEED),
-        Misconception(
-            "seeded-once", _returns(reset=lambda env, seed, episode: env.reset(seed=None if episode else seed)), _SEEDED_ONCE
-        ),
-        Misconception("truncation-ignored", _returns(ended=lambda terminated, _: terminated), _TRUNCATED),
-        Misconception("termination-ignored", _returns(ended=lambda _, truncated: truncated), _TERMINATED),
-        Misconception("batch-axis-missing", _returns(call=lambda policy, obs: policy(obs)), _BATCH),
-        Misconception(
-            "a-list-of-numbers",
-            _returns(lambda returns, _: returns.tolist()),
-            "Return a tensor of shape (E,), not a list of numbers.",
-        ),
-        Misconception(
-            "dtype-lost",
-            _returns(lambda returns, _: returns.double()),
-            "The returns are to be float32; NumPy's own numbers are float64.",
-        ),
-        Misconception("bad-input-accepted", _returns(checked=False), _EPISODES),
+        *wrong(_WRONG_EVALUATE),
+        bad_input_accepted(_returns(checked=False), _EPISODES),
     ),
     variants={
-        "rewards summed afterwards": _summed_afterwards,
-        "a buffer of returns": _in_a_buffer,
-        "the returns of demonstrations": lambda *given, **named: _from_whole_episodes(*given, **named).returns,
+        "rewards summed afterwards": _rolled(_summed_afterwards),
+        "a buffer of returns": _rolled(_in_a_buffer),
+        "the returns of demonstrations": _rolled(lambda *given: _from_whole_episodes(*given).returns),
         "the loop with its parts": _returns(),
     },
 )
@@ -1305,7 +1146,7 @@ def _clouds(sizes=(18, 13), dims=4, moved=0.7, widened=1.4):
 
     def inputs(generator):
         units = torch.tensor([1.0, 30.0, 0.02, 5.0], dtype=torch.float64)[:dims]
-        expert, agent = (_normal(generator, size, dims) for size in sizes)
+        expert, agent = (normal(generator, size, dims) for size in sizes)
         return {"expert_obs": units * expert + 2 * units, "agent_obs": units * (widened * agent + moved) + 2 * units}
 
     return inputs
@@ -1316,9 +1157,8 @@ def _twice_the_same(generator):
     return drawn | {"agent_obs": drawn["expert_obs"].flip(0)}
 
 
-def _two_points(generator):
+def _two_points(_generator):
     """Expert at 0 and 2 (deviation √2, or 1 if biased), agent at a third place, always."""
-    del generator
     return {
         "expert_obs": torch.tensor([[0.0], [2.0]], dtype=torch.float64),
         "agent_obs": torch.full((3, 1), 4.0, dtype=torch.float64),
@@ -1339,14 +1179,19 @@ def _others(distances):
     return distances.sum() / (count * (count - 1))
 
 
+_comparable = satisfies(
+    lambda expert_obs, agent_obs: expert_obs.ndim == agent_obs.ndim == 2 and expert_obs.shape[1] == agent_obs.shape[1]
+)
+
+
 def _shift(formula=_energy, scale=lambda expert, agent: expert.std(0), checked=True):
-    def version(expert_obs, agent_obs):
-        if checked and (expert_obs.ndim != 2 or agent_obs.ndim != 2 or expert_obs.shape[1] != agent_obs.shape[1]):
-            raise ValueError("expert_obs must be (N, O) and agent_obs (M, O)")
+    """A version: `formula` of both samples, after division by `scale`."""
+
+    def scaled(expert_obs, agent_obs):
         scales = scale(expert_obs, agent_obs)
         return formula(expert_obs / scales, agent_obs / scales)
 
-    return version
+    return versions_of(ch74.state_shift, _comparable)(scaled, checked)
 
 
 def _biased(expert, _agent):
@@ -1372,6 +1217,69 @@ def _weighted(x, y):
 
 _SHIFT_PAIR = ("expert_obs", "agent_obs")
 
+_WRONG_STATE_SHIFT = {
+    "factor-two-missing": (
+        _shift(lambda x, y: _apart(x, y).mean() - _apart(x, x).mean() - _apart(y, y).mean()),
+        "The mean distance between the samples counts twice: with once, equal samples are not at distance 0.",
+    ),
+    "cross-term-only": (
+        _shift(lambda x, y: _apart(x, y).mean()),
+        "This is the mean distance between the samples, which is large for equal samples too: subtract the distances within each.",
+    ),
+    "self-pairs-excluded": (
+        _shift(lambda x, y: _energy(x, y, own=_others)),
+        "Within a sample all ordered pairs count, i = j included: divide by N², not by N (N - 1).",
+    ),
+    "halves-of-the-pairs": (
+        _shift(lambda x, y: _energy(x, y, own=lambda d: d.triu().sum() / d.numel())),
+        "Ordered pairs: (i, j) and (j, i) both count, and here only one of them does.",
+    ),
+    "not-scaled": (
+        _shift(scale=lambda expert, agent: 1.0),
+        "Nothing is scaled: the dimension with the largest unit decides alone.",
+    ),
+    "scaled-by-the-agent": (
+        _shift(scale=lambda expert, agent: agent.std(0)),
+        "Divide both by the *expert's* deviation: with its own, an agent that strays far looks close.",
+    ),
+    "each-by-its-own": (
+        lambda expert_obs, agent_obs: _shift(lambda x, y: _energy(x, y / agent_obs.std(0) * expert_obs.std(0)))(
+            expert_obs, agent_obs
+        ),
+        "Each sample is divided by its own deviation, which hides that one is wider: use the expert's for both.",
+    ),
+    "scaled-by-the-pooled": (
+        _shift(scale=lambda expert, agent: torch.cat([expert, agent]).std(0)),
+        "The deviation is that of both samples together, and grows with the shift: use the expert's alone.",
+    ),
+    "scaled-by-the-variance": (
+        _shift(scale=lambda expert, agent: expert.var(0)),
+        "Divide by the standard deviation, not by the variance: the result must not depend on the unit.",
+    ),
+    "one-scale-for-all": (
+        _shift(scale=lambda expert, agent: expert.std()),
+        "One deviation over all entries is used: each dimension has its own, std(0).",
+    ),
+    "root-taken": (
+        _shift(lambda x, y: _energy(x, y).clamp(min=0).sqrt()),
+        "The *squared* energy distance is asked for: take no root.",
+    ),
+    "distances-squared": (
+        _shift(lambda x, y: _energy(x, y, lambda a, b: _apart(a, b).square())),
+        "The distances are squared: then only the means count, and two samples of one mean look equal however they differ.",
+    ),
+    "city-block": (
+        _shift(lambda x, y: _energy(x, y, lambda a, b: (a[:, None] - b[None]).abs().sum(-1))),
+        "The distance is Euclidean: the root of the sum of squares over the dimensions.",
+    ),
+    "dimension-by-dimension": (
+        _shift(lambda x, y: torch.stack([_energy(x[:, [i]], y[:, [i]]) for i in range(x.shape[1])]).mean()),
+        "The dimensions are compared one by one, which cannot see how they belong together: use the distance of whole states.",
+    ),
+    "sign-flipped": (_shift(lambda x, y: -_energy(x, y)), "The sign is flipped: the distances within are subtracted."),
+    "python-float": (_shift(lambda x, y: _energy(x, y).item()), "Return a 0-dim tensor, not a Python float."),
+}
+
 STATE_SHIFT = Exercise(
     name="state_shift",
     reference=ch74.state_shift,
@@ -1387,92 +1295,16 @@ STATE_SHIFT = Exercise(
         Case("single precision", _clouds(), dtype=torch.float32, visible=True),
         Case(
             "agent_obs with a dimension too few",
-            _changed("agent_obs", lambda x: x[:, :1], _clouds()),
+            reshaped(_clouds(), "agent_obs", lambda x: x[:, :1]),
             raises=_SHIFT_PAIR,
             visible=True,
         ),
-        Case("agent_obs as a single row", _changed("agent_obs", lambda x: x[0], _clouds()), raises=_SHIFT_PAIR),
+        Case("agent_obs as a single row", reshaped(_clouds(), "agent_obs", lambda x: x[0]), raises=_SHIFT_PAIR),
     ),
     misconceptions=(
-        Misconception(
-            "factor-two-missing",
-            _shift(lambda x, y: _apart(x, y).mean() - _apart(x, x).mean() - _apart(y, y).mean()),
-            "The mean distance between the samples counts twice: with once, equal samples are not at distance 0.",
-        ),
-        Misconception(
-            "cross-term-only",
-            _shift(lambda x, y: _apart(x, y).mean()),
-            "This is the mean distance between the samples, which is large for equal samples too: subtract the distances within each.",
-        ),
-        Misconception(
-            "self-pairs-excluded",
-            _shift(lambda x, y: _energy(x, y, own=_others)),
-            "Within a sample all ordered pairs count, i = j included: divide by N², not by N (N - 1).",
-        ),
-        Misconception(
-            "halves-of-the-pairs",
-            _shift(lambda x, y: _energy(x, y, own=lambda d: d.triu().sum() / d.numel())),
-            "Ordered pairs: (i, j) and (j, i) both count, and here only one of them does.",
-        ),
-        Misconception(
-            "not-scaled",
-            _shift(scale=lambda expert, agent: 1.0),
-            "Nothing is scaled: the dimension with the largest unit decides alone.",
-        ),
-        Misconception(
-            "scaled-by-the-agent",
-            _shift(scale=lambda expert, agent: agent.std(0)),
-            "Divide both by the *expert's* deviation: with its own, an agent that strays far looks close.",
-        ),
-        Misconception(
-            "each-by-its-own",
-            lambda expert_obs, agent_obs: _shift(lambda x, y: _energy(x, y / agent_obs.std(0) * expert_obs.std(0)))(
-                expert_obs, agent_obs
-            ),
-            "Each sample is divided by its own deviation, which hides that one is wider: use the expert's for both.",
-        ),
-        Misconception(
-            "scaled-by-the-pooled",
-            _shift(scale=lambda expert, agent: torch.cat([expert, agent]).std(0)),
-            "The deviation is that of both samples together, and grows with the shift: use the expert's alone.",
-        ),
-        Misconception(
-            "scaled-by-the-variance",
-            _shift(scale=lambda expert, agent: expert.var(0)),
-            "Divide by the standard deviation, not by the variance: the result must not depend on the unit.",
-        ),
-        Misconception(
-            "one-scale-for-all",
-            _shift(scale=lambda expert, agent: expert.std()),
-            "One deviation over all entries is used: each dimension has its own, std(0).",
-        ),
-        Misconception(
-            "root-taken",
-            _shift(lambda x, y: _energy(x, y).clamp(min=0).sqrt()),
-            "The *squared* energy distance is asked for: take no root.",
-        ),
-        Misconception(
-            "distances-squared",
-            _shift(lambda x, y: _energy(x, y, lambda a, b: _apart(a, b).square())),
-            "The distances are squared: then only the means count, and two samples of one mean look equal however they differ.",
-        ),
-        Misconception(
-            "city-block",
-            _shift(lambda x, y: _energy(x, y, lambda a, b: (a[:, None] - b[None]).abs().sum(-1))),
-            "The distance is Euclidean: the root of the sum of squares over the dimensions.",
-        ),
-        Misconception(
-            "dimension-by-dimension",
-            _shift(lambda x, y: torch.stack([_energy(x[:, [i]], y[:, [i]]) for i in range(x.shape[1])]).mean()),
-            "The dimensions are compared one by one, which cannot see how they belong together: use the distance of whole states.",
-        ),
-        Misconception(
-            "sign-flipped", _shift(lambda x, y: -_energy(x, y)), "The sign is flipped: the distances within are subtracted."
-        ),
-        Misconception("python-float", _shift(lambda x, y: _energy(x, y).item()), "Return a 0-dim tensor, not a Python float."),
-        Misconception("dtype-lost", _after(ch74.state_shift, torch.Tensor.float), _DTYPE),
-        Misconception(
-            "bad-input-accepted",
+        *wrong(_WRONG_STATE_SHIFT),
+        dtype_lost(ch74.state_shift),
+        bad_input_accepted(
             _shift(checked=False),
             "A sample with one dimension, or a single row, broadcasts silently against the other: compare the shapes first.",
         ),
@@ -1501,23 +1333,18 @@ def _log(lengths=(5, 4, 6), ids=None):
     def inputs(generator):
         size = sum(lengths)
         return {
-            "obs": _normal(generator, size, 3),
-            "actions": _normal(generator, size, 2),
+            "obs": normal(generator, size, 3),
+            "actions": normal(generator, size, 2),
             "episode_ids": _steps(lengths, ids),
         }
 
     return inputs
 
 
-def _pairs(choose, checked=True):
-    """A version of the repair: `choose` takes obs, actions and ids, and gives the two columns."""
-
-    def version(obs, actions, episode_ids):
-        if checked:
-            validate.same_length(obs=obs, actions=actions, episode_ids=episode_ids)
-        return choose(obs, actions, episode_ids)
-
-    return version
+_COLUMNS = ("obs", "actions", "episode_ids")
+_pairs = versions_of(
+    ch74.repaired_pairs, satisfies(lambda obs, actions, episode_ids: len(obs) == len(actions) == len(episode_ids))
+)
 
 
 def _within(ids):
@@ -1552,6 +1379,53 @@ def _unchecked_pairs(obs, actions, ids):
     return obs[: size - 1][same], actions[1:size][same]
 
 
+_WRONG_REPAIRED_PAIRS = {
+    "as-logged": (
+        lambda obs, actions, ids: (obs.clone(), actions.clone()),
+        "This is the suspect's log as it is. What is in `obs[t]` when its copy is made: what the driver saw, or what came after?",
+    ),
+    "shifted-the-wrong-way": (
+        lambda obs, actions, ids: (obs[1:][_within(ids)], actions[:-1][_within(ids)]),
+        "Now the observations are two steps late: each row of the log holds what came *after* its action.",
+    ),
+    "across-episodes": (
+        lambda obs, actions, ids: (obs[:-1], actions[1:]),
+        "The last observation of an episode is paired with the first action of the next: no pair may cross an end.",
+    ),
+    "rolled-around": (
+        lambda obs, actions, ids: (obs.roll(1, 0), actions),
+        "roll pairs the first action with the log's last observation, and each episode's first with the one before: drop these rows.",
+    ),
+    "rolled-within-episodes": (
+        _by_episode(lambda obs, actions: (obs.roll(1, 0), actions)),
+        "Each episode's first action is paired with the episode's last observation. What the driver saw is not in the log: drop it.",
+    ),
+    "first-row-kept": (
+        _by_episode(lambda obs, actions: (torch.cat([obs[:1], obs[:-1]]), actions)),
+        "Each episode's first action is paired with an observation that came after it. What the driver saw is lost: drop the pair.",
+    ),
+    "shifted-by-two": (_by_episode(lambda obs, actions: (obs[:-2], actions[2:])), "The log is late by one step, not by two."),
+    "last-pairs-dropped": (
+        _by_episode(lambda obs, actions: (obs[:-2], actions[1:-1])),
+        "The last pair of each episode is missing, although the log holds both its halves.",
+    ),
+    "first-episode-only": (
+        lambda obs, actions, ids: (obs[ids == ids[0]][:-1], actions[ids == ids[0]][1:]),
+        "All but the first episode are gone.",
+    ),
+    "columns-swapped": (
+        lambda obs, actions, ids: (actions[1:][_within(ids)], obs[:-1][_within(ids)]),
+        "Return the observations first, then the actions.",
+    ),
+    "episodes-sorted": (
+        lambda obs, actions, ids: _by_episode(lambda o, a: (o[:-1], a[1:]))(
+            *(column[ids.argsort(stable=True)] for column in (obs, actions, ids))
+        ),
+        "The rows are sorted by the episodes' numbers: keep the order of the log.",
+    ),
+    "dtype-lost": (lambda obs, actions, ids: (obs[:-1][_within(ids)].float(), actions[1:][_within(ids)].float()), DTYPE),
+}
+
 REPAIRED_PAIRS = Exercise(
     name="repaired_pairs",
     reference=ch74.repaired_pairs,
@@ -1564,85 +1438,16 @@ REPAIRED_PAIRS = Exercise(
         Case("many episodes", _log((3,) * 12), closed_form=_pairs(_by_index)),
         Case("one pair", _log((1, 2, 1)), closed_form=_pairs(_by_index)),
         Case("single precision", _log(), dtype=torch.float32, visible=True),
-        Case(
-            "actions with a row too few",
-            _changed("actions", lambda a: a[:-1], _log()),
-            raises=["obs", "actions", "episode_ids"],
-            visible=True,
-        ),
+        Case("actions with a row too few", reshaped(_log(), "actions", lambda a: a[:-1]), raises=_COLUMNS, visible=True),
         Case(
             "episode_ids with a row too many",
-            _changed("episode_ids", lambda ids: torch.cat([ids, ids[-1:]]), _log()),
-            raises=["obs", "actions", "episode_ids"],
+            reshaped(_log(), "episode_ids", lambda ids: torch.cat([ids, ids[-1:]])),
+            raises=_COLUMNS,
         ),
     ),
     misconceptions=(
-        Misconception(
-            "as-logged",
-            _pairs(lambda obs, actions, ids: (obs.clone(), actions.clone())),
-            "This is the suspect's log as it is. What is in `obs[t]` when its copy is made: what the driver saw, or what came after?",
-        ),
-        Misconception(
-            "shifted-the-wrong-way",
-            _pairs(lambda obs, actions, ids: (obs[1:][_within(ids)], actions[:-1][_within(ids)])),
-            "Now the observations are two steps late: each row of the log holds what came *after* its action.",
-        ),
-        Misconception(
-            "across-episodes",
-            _pairs(lambda obs, actions, ids: (obs[:-1], actions[1:])),
-            "The last observation of an episode is paired with the first action of the next: no pair may cross an end.",
-        ),
-        Misconception(
-            "rolled-around",
-            _pairs(lambda obs, actions, ids: (obs.roll(1, 0), actions)),
-            "roll pairs the first action with the log's last observation, and each episode's first with the one before: drop these rows.",
-        ),
-        Misconception(
-            "rolled-within-episodes",
-            _pairs(_by_episode(lambda obs, actions: (obs.roll(1, 0), actions))),
-            "Each episode's first action is paired with the episode's last observation. What the driver saw is not in the log: drop it.",
-        ),
-        Misconception(
-            "first-row-kept",
-            _pairs(_by_episode(lambda obs, actions: (torch.cat([obs[:1], obs[:-1]]), actions))),
-            "Each episode's first action is paired with an observation that came after it. What the driver saw is lost: drop the pair.",
-        ),
-        Misconception(
-            "shifted-by-two",
-            _pairs(_by_episode(lambda obs, actions: (obs[:-2], actions[2:]))),
-            "The log is late by one step, not by two.",
-        ),
-        Misconception(
-            "last-pairs-dropped",
-            _pairs(_by_episode(lambda obs, actions: (obs[:-2], actions[1:-1]))),
-            "The last pair of each episode is missing, although the log holds both its halves.",
-        ),
-        Misconception(
-            "first-episode-only",
-            _pairs(lambda obs, actions, ids: (obs[ids == ids[0]][:-1], actions[ids == ids[0]][1:])),
-            "All but the first episode are gone.",
-        ),
-        Misconception(
-            "columns-swapped",
-            _pairs(lambda obs, actions, ids: (actions[1:][_within(ids)], obs[:-1][_within(ids)])),
-            "Return the observations first, then the actions.",
-        ),
-        Misconception(
-            "episodes-sorted",
-            _pairs(
-                lambda obs, actions, ids: _by_episode(lambda o, a: (o[:-1], a[1:]))(
-                    *(column[ids.argsort(stable=True)] for column in (obs, actions, ids))
-                )
-            ),
-            "The rows are sorted by the episodes' numbers: keep the order of the log.",
-        ),
-        Misconception(
-            "dtype-lost",
-            _pairs(lambda obs, actions, ids: (obs[:-1][_within(ids)].float(), actions[1:][_within(ids)].float())),
-            _DTYPE,
-        ),
-        Misconception(
-            "bad-input-accepted",
+        *wrong(_WRONG_REPAIRED_PAIRS, _pairs),
+        bad_input_accepted(
             _pairs(_unchecked_pairs, checked=False),
             "Columns of different lengths pair up wrongly, or fail elsewhere: compare their numbers of rows first.",
         ),
