@@ -12,19 +12,23 @@ from torch.nn import functional
 
 from autograder.authoring.parts import (
     CUT,
-    SHAPES,
     after,
+    bad_input_accepted,
     cut_from_graph,
     drawn_once,
     dtype_lost,
     in_place,
     normal,
+    one_shape,
     python_float,
     refused,
     replaced,
+    satisfies,
     shape_cases,
     uniform,
+    versions_of,
     without,
+    wrong,
 )
 from autograder.authoring.spec import Case, Exercise, Misconception
 from course_lib.checks.cases import built
@@ -32,14 +36,6 @@ from course_lib.control.replay import Transitions
 from solutions import ch48
 
 HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
-
-
-def _same_shapes(**tensors):
-    """Another style of validation than the reference's."""
-    (first, expected), *others = ((name, tuple(tensor.shape)) for name, tensor in tensors.items())
-    for name, shape in others:
-        if shape != expected:
-            raise ValueError(f"{name} is of shape {shape}, but {first} is {expected}: they must agree")
 
 
 # ------------------------------------------------------------------------------------------- squashed_gaussian_log_prob
@@ -100,13 +96,7 @@ def _slope(u):
     return 2 * (math.log(2) - u - functional.softplus(-2 * u))
 
 
-def _density(formula, checked=True):
-    def version(mean, log_std, pre_tanh_actions):
-        if checked:
-            _same_shapes(mean=mean, log_std=log_std, pre_tanh_actions=pre_tanh_actions)
-        return formula(mean, log_std, pre_tanh_actions)
-
-    return version
+_density = versions_of(ch48.squashed_gaussian_log_prob, one_shape(*_SQUASHED))
 
 
 def _distribution_object(m, s, u):
@@ -114,6 +104,65 @@ def _distribution_object(m, s, u):
     transform = squashed.transforms[-1]
     return squashed.base_dist.log_prob(u) - transform.log_abs_det_jacobian(u, u.tanh()).sum(-1)
 
+
+_WRONG_SQUASHED_GAUSSIAN_LOG_PROB = {
+    "squashing-ignored": (
+        lambda m, s, u: _normal(m, s, u).sum(-1),
+        "This is the density of u. tanh squeezes the line into (-1, 1), and the density of tanh(u) is higher by 1 / (1 - tanh² u)"
+        " in each component: subtract log(1 - tanh² u).",
+    ),
+    "correction-added": (
+        lambda m, s, u: (_normal(m, s, u) + _slope(u)).sum(-1),
+        "The correction has the wrong sign: where tanh is flat, many u end up close together, and the density is higher.",
+    ),
+    "unstable": (
+        lambda m, s, u: (_normal(m, s, u) - (1 - u.tanh().square()).log()).sum(-1),
+        "For |u| above 20 the tangent rounds to ±1, 1 - tanh² u to 0, and its logarithm is -inf:"
+        " 2 (log 2 - u - softplus(-2u)) is the same and is right everywhere.",
+    ),
+    "epsilon": (
+        lambda m, s, u: (_normal(m, s, u) - (1 - u.tanh().square() + 1e-6).log()).sum(-1),
+        "The 1e-6 inside the logarithm avoids -inf, but the density of saturated actions is then wrong by any amount, and its"
+        " gradient is 0: use 2 (log 2 - u - softplus(-2u)).",
+    ),
+    "clamped": (
+        lambda m, s, u: (_normal(m, s, u) - (1 - u.tanh().square()).clamp(1e-6, 1).log()).sum(-1),
+        "The clamp avoids -inf, but beyond it the density is wrong and its gradient 0: use 2 (log 2 - u - softplus(-2u)).",
+    ),
+    "slope-without-square": (
+        lambda m, s, u: (_normal(m, s, u) - (1 - u.tanh()).clamp_min(1e-300).log()).sum(-1),
+        "The derivative of tanh u is 1 - tanh² u: the square is missing.",
+    ),
+    "squashed-action-in-the-normal-density": (
+        lambda m, s, u: (_normal(m, s, u.tanh()) - _slope(u)).sum(-1),
+        "The normal density is that of u, before squashing: it is given tanh(u) here.",
+    ),
+    "mean-squashed": (
+        lambda m, s, u: (_normal(m.tanh(), s, u) - _slope(u)).sum(-1),
+        "The mean of u is `mean` itself: only the action is squashed.",
+    ),
+    "log-std-taken-as-std": (
+        lambda m, s, u: (-0.5 * ((u - m) / s) ** 2 - s.abs().log() - HALF_LOG_TWO_PI - _slope(u)).sum(-1),
+        "log_std is the logarithm of the standard deviation: take its exponential before dividing.",
+    ),
+    "correction-once": (
+        lambda m, s, u: _normal(m, s, u).sum(-1) - _slope(u).mean(-1),
+        "Every component is squashed: sum the corrections, as the normal log-densities are summed.",
+    ),
+    "not-summed": (
+        lambda m, s, u: _normal(m, s, u) - _slope(u),
+        "One number for each sample, (B,): the components are independent, so their log-densities add up.",
+    ),
+    "summed-over-samples": (
+        lambda m, s, u: (_normal(m, s, u) - _slope(u)).sum(0),
+        "Sum over the action's components, the last axis, not over the samples.",
+    ),
+    "actions-detached": (
+        lambda m, s, u: (_normal(m, s, u.detach()) - _slope(u.detach())).sum(-1),
+        "No gradient passes through pre_tanh_actions. In SAC the action is a function of the policy's outputs, u = μ + σ ε, and"
+        " without this path the policy's entropy never learns.",
+    ),
+}
 
 SQUASHED_GAUSSIAN_LOG_PROB = Exercise(
     name="squashed_gaussian_log_prob",
@@ -140,81 +189,11 @@ SQUASHED_GAUSSIAN_LOG_PROB = Exercise(
         *shape_cases(_squashed(), _SQUASHED),
     ),
     misconceptions=(
-        Misconception(
-            "squashing-ignored",
-            _density(lambda m, s, u: _normal(m, s, u).sum(-1)),
-            "This is the density of u. tanh squeezes the line into (-1, 1), and the density of tanh(u) is higher by 1 / (1 - tanh² u)"
-            " in each component: subtract log(1 - tanh² u).",
-        ),
-        Misconception(
-            "correction-added",
-            _density(lambda m, s, u: (_normal(m, s, u) + _slope(u)).sum(-1)),
-            "The correction has the wrong sign: where tanh is flat, many u end up close together, and the density is higher.",
-        ),
-        Misconception(
-            "unstable",
-            _density(lambda m, s, u: (_normal(m, s, u) - (1 - u.tanh().square()).log()).sum(-1)),
-            "For |u| above 20 the tangent rounds to ±1, 1 - tanh² u to 0, and its logarithm is -inf:"
-            " 2 (log 2 - u - softplus(-2u)) is the same and is right everywhere.",
-        ),
-        Misconception(
-            "epsilon",
-            _density(lambda m, s, u: (_normal(m, s, u) - (1 - u.tanh().square() + 1e-6).log()).sum(-1)),
-            "The 1e-6 inside the logarithm avoids -inf, but the density of saturated actions is then wrong by any amount, and its"
-            " gradient is 0: use 2 (log 2 - u - softplus(-2u)).",
-        ),
-        Misconception(
-            "clamped",
-            _density(lambda m, s, u: (_normal(m, s, u) - (1 - u.tanh().square()).clamp(1e-6, 1).log()).sum(-1)),
-            "The clamp avoids -inf, but beyond it the density is wrong and its gradient 0: use 2 (log 2 - u - softplus(-2u)).",
-        ),
-        Misconception(
-            "slope-without-square",
-            _density(lambda m, s, u: (_normal(m, s, u) - (1 - u.tanh()).clamp_min(1e-300).log()).sum(-1)),
-            "The derivative of tanh u is 1 - tanh² u: the square is missing.",
-        ),
-        Misconception(
-            "squashed-action-in-the-normal-density",
-            _density(lambda m, s, u: (_normal(m, s, u.tanh()) - _slope(u)).sum(-1)),
-            "The normal density is that of u, before squashing: it is given tanh(u) here.",
-        ),
-        Misconception(
-            "mean-squashed",
-            _density(lambda m, s, u: (_normal(m.tanh(), s, u) - _slope(u)).sum(-1)),
-            "The mean of u is `mean` itself: only the action is squashed.",
-        ),
-        Misconception(
-            "log-std-taken-as-std",
-            _density(lambda m, s, u: (-0.5 * ((u - m) / s) ** 2 - s.abs().log() - HALF_LOG_TWO_PI - _slope(u)).sum(-1)),
-            "log_std is the logarithm of the standard deviation: take its exponential before dividing.",
-        ),
-        Misconception(
-            "correction-once",
-            _density(lambda m, s, u: _normal(m, s, u).sum(-1) - _slope(u).mean(-1)),
-            "Every component is squashed: sum the corrections, as the normal log-densities are summed.",
-        ),
-        Misconception(
-            "not-summed",
-            _density(lambda m, s, u: _normal(m, s, u) - _slope(u)),
-            "One number for each sample, (B,): the components are independent, so their log-densities add up.",
-        ),
-        Misconception(
-            "summed-over-samples",
-            _density(lambda m, s, u: (_normal(m, s, u) - _slope(u)).sum(0)),
-            "Sum over the action's components, the last axis, not over the samples.",
-        ),
-        Misconception(
-            "actions-detached",
-            _density(lambda m, s, u: (_normal(m, s, u.detach()) - _slope(u.detach())).sum(-1)),
-            "No gradient passes through pre_tanh_actions. In SAC the action is a function of the policy's outputs, u = μ + σ ε, and"
-            " without this path the policy's entropy never learns.",
-        ),
+        *wrong(_WRONG_SQUASHED_GAUSSIAN_LOG_PROB, _density),
         cut_from_graph(ch48.squashed_gaussian_log_prob),
         dtype_lost(ch48.squashed_gaussian_log_prob),
         in_place(ch48.squashed_gaussian_log_prob, "pre_tanh_actions", 2),
-        Misconception(
-            "bad-input-accepted", _density(lambda m, s, u: (_normal(m, s, u) - _slope(u)).sum(-1), checked=False), SHAPES
-        ),
+        bad_input_accepted(_density(lambda m, s, u: (_normal(m, s, u) - _slope(u)).sum(-1), checked=False)),
     ),
     variants={
         "distribution objects": _density(_distribution_object),
@@ -277,19 +256,17 @@ def _target_by_steps(rewards, terminated, next_q1, next_q2, next_log_probs, alph
     )
 
 
+_checked_target = versions_of(ch48.soft_q_target, one_shape(*_TARGET_SHAPES), satisfies(lambda gamma: 0 <= gamma <= 1))
+
+
 def _target(formula, checked=True, detached=True):
     """A version: `formula` takes r, goes_on (0 or 1 in r's dtype), q1, q2, log_probs, alpha, gamma."""
 
-    def version(rewards, terminated, next_q1, next_q2, next_log_probs, alpha, gamma=0.99):
-        if checked:
-            _same_shapes(rewards=rewards, terminated=terminated, next_q1=next_q1, next_q2=next_q2, next_log_probs=next_log_probs)
-            if gamma < 0 or gamma > 1:
-                raise ValueError(f"gamma is a discount in [0, 1], received {gamma}")
-        goes_on = 1 - terminated.to(rewards.dtype)
-        result = formula(rewards, goes_on, next_q1, next_q2, next_log_probs, alpha, gamma)
+    def version(rewards, terminated, *others):
+        result = formula(rewards, 1 - terminated.to(rewards.dtype), *others)
         return result.detach() if detached else result
 
-    return version
+    return _checked_target(version, checked)
 
 
 def _soft(r, c, q1, q2, lp, alpha, gamma):
@@ -301,6 +278,65 @@ def _masked_assignment(r, c, q1, q2, lp, alpha, gamma):
     following[c == 0] = 0
     return r + gamma * following
 
+
+_WRONG_SOFT_Q_TARGET = {
+    "maximum-of-the-critics": (
+        lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (torch.maximum(q1, q2) - alpha * lp),
+        "This is the larger of the two values. The policy seeks out what is overestimated: the smaller one guards against that.",
+    ),
+    "mean-of-the-critics": (
+        lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (0.5 * (q1 + q2) - alpha * lp),
+        "This is the mean of the two values: the minimum is what guards against overestimation.",
+    ),
+    "first-critic-only": (
+        lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (q1 - alpha * lp),
+        "next_q2 is not used: the target takes the smaller of the two values.",
+    ),
+    "second-critic-only": (
+        lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (q2 - alpha * lp),
+        "next_q1 is not used: the target takes the smaller of the two values.",
+    ),
+    "entropy-missing": (
+        lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * torch.minimum(q1, q2),
+        "The next state's soft value is min(Q₁, Q₂) - α log π: the entropy term is missing, as in TD3.",
+    ),
+    "entropy-with-the-wrong-sign": (
+        lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (torch.minimum(q1, q2) + alpha * lp),
+        "Randomness is rewarded: the entropy is -log π, so α log π is subtracted.",
+    ),
+    "alpha-missing": (
+        lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (torch.minimum(q1, q2) - lp),
+        "alpha is not used: it is the price of a nat of entropy in units of reward.",
+    ),
+    "entropy-of-the-end": (
+        lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * (c * torch.minimum(q1, q2) - alpha * lp),
+        "The entropy term is left standing where the task has ended: after the end no action is taken, and none is random.",
+    ),
+    "entropy-not-discounted": (
+        lambda r, c, q1, q2, lp, alpha, gamma: r + c * (gamma * torch.minimum(q1, q2) - alpha * lp),
+        "The entropy is that of the next action, one step away: it is discounted as the value is.",
+    ),
+    "end-ignored": (
+        lambda r, c, q1, q2, lp, alpha, gamma: _soft(r, 1.0, q1, q2, lp, alpha, gamma),
+        "terminated is not used: nothing follows where the task has ended.",
+    ),
+    "end-inverted": (
+        lambda r, c, q1, q2, lp, alpha, gamma: _soft(r, 1 - c, q1, q2, lp, alpha, gamma),
+        "The bootstrap is kept where the task has ended and dropped where it goes on: multiply by 1 - terminated.",
+    ),
+    "reward-dropped-at-the-end": (
+        lambda r, c, q1, q2, lp, alpha, gamma: _soft(r, c, q1, q2, lp, alpha, gamma) * c,
+        "The last reward is paid, too: only what follows it falls away.",
+    ),
+    "gamma-missing": (
+        lambda r, c, q1, q2, lp, alpha, gamma: _soft(r, c, q1, q2, lp, alpha, 1.0),
+        "What follows is not discounted: multiply it by gamma.",
+    ),
+    "gamma-on-the-reward": (
+        lambda r, c, q1, q2, lp, alpha, gamma: gamma * _soft(r, c, q1, q2, lp, alpha, 1.0),
+        "The reward of this step is not discounted: gamma belongs to what follows.",
+    ),
+}
 
 SOFT_Q_TARGET = Exercise(
     name="soft_q_target",
@@ -327,76 +363,7 @@ SOFT_Q_TARGET = Exercise(
         refused(_steps(), gamma=-0.1),
     ),
     misconceptions=(
-        Misconception(
-            "maximum-of-the-critics",
-            _target(lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (torch.maximum(q1, q2) - alpha * lp)),
-            "This is the larger of the two values. The policy seeks out what is overestimated: the smaller one guards against that.",
-        ),
-        Misconception(
-            "mean-of-the-critics",
-            _target(lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (0.5 * (q1 + q2) - alpha * lp)),
-            "This is the mean of the two values: the minimum is what guards against overestimation.",
-        ),
-        Misconception(
-            "first-critic-only",
-            _target(lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (q1 - alpha * lp)),
-            "next_q2 is not used: the target takes the smaller of the two values.",
-        ),
-        Misconception(
-            "second-critic-only",
-            _target(lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (q2 - alpha * lp)),
-            "next_q1 is not used: the target takes the smaller of the two values.",
-        ),
-        Misconception(
-            "entropy-missing",
-            _target(lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * torch.minimum(q1, q2)),
-            "The next state's soft value is min(Q₁, Q₂) - α log π: the entropy term is missing, as in TD3.",
-        ),
-        Misconception(
-            "entropy-with-the-wrong-sign",
-            _target(lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (torch.minimum(q1, q2) + alpha * lp)),
-            "Randomness is rewarded: the entropy is -log π, so α log π is subtracted.",
-        ),
-        Misconception(
-            "alpha-missing",
-            _target(lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (torch.minimum(q1, q2) - lp)),
-            "alpha is not used: it is the price of a nat of entropy in units of reward.",
-        ),
-        Misconception(
-            "entropy-of-the-end",
-            _target(lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * (c * torch.minimum(q1, q2) - alpha * lp)),
-            "The entropy term is left standing where the task has ended: after the end no action is taken, and none is random.",
-        ),
-        Misconception(
-            "entropy-not-discounted",
-            _target(lambda r, c, q1, q2, lp, alpha, gamma: r + c * (gamma * torch.minimum(q1, q2) - alpha * lp)),
-            "The entropy is that of the next action, one step away: it is discounted as the value is.",
-        ),
-        Misconception(
-            "end-ignored",
-            _target(lambda r, c, q1, q2, lp, alpha, gamma: _soft(r, 1.0, q1, q2, lp, alpha, gamma)),
-            "terminated is not used: nothing follows where the task has ended.",
-        ),
-        Misconception(
-            "end-inverted",
-            _target(lambda r, c, q1, q2, lp, alpha, gamma: _soft(r, 1 - c, q1, q2, lp, alpha, gamma)),
-            "The bootstrap is kept where the task has ended and dropped where it goes on: multiply by 1 - terminated.",
-        ),
-        Misconception(
-            "reward-dropped-at-the-end",
-            _target(lambda r, c, q1, q2, lp, alpha, gamma: _soft(r, c, q1, q2, lp, alpha, gamma) * c),
-            "The last reward is paid, too: only what follows it falls away.",
-        ),
-        Misconception(
-            "gamma-missing",
-            _target(lambda r, c, q1, q2, lp, alpha, gamma: _soft(r, c, q1, q2, lp, alpha, 1.0)),
-            "What follows is not discounted: multiply it by gamma.",
-        ),
-        Misconception(
-            "gamma-on-the-reward",
-            _target(lambda r, c, q1, q2, lp, alpha, gamma: gamma * _soft(r, c, q1, q2, lp, alpha, 1.0)),
-            "The reward of this step is not discounted: gamma belongs to what follows.",
-        ),
+        *wrong(_WRONG_SOFT_Q_TARGET, _target),
         Misconception(
             "graph-kept",
             _target(_soft, detached=False),
@@ -405,7 +372,7 @@ SOFT_Q_TARGET = Exercise(
         ),
         dtype_lost(ch48.soft_q_target),
         in_place(ch48.soft_q_target, "rewards"),
-        Misconception("bad-input-accepted", _target(_soft, checked=False), SHAPES),
+        bad_input_accepted(_target(_soft, checked=False)),
     ),
     variants={
         "multiplied by 1 - terminated": _target(_soft),
@@ -450,19 +417,64 @@ def _actor_by_samples(q1, q2, log_probs, alpha):
     return torch.tensor(sum(terms) / len(terms), dtype=q1.dtype)
 
 
-def _actor(formula, checked=True, leak=False):
-    def version(q1, q2, log_probs, alpha):
-        if checked:
-            _same_shapes(q1=q1, q2=q2, log_probs=log_probs)
-        fixed = alpha.detach() if isinstance(alpha, torch.Tensor) and not leak else alpha
-        return formula(q1, q2, log_probs, fixed)
-
-    return version
+_actor = versions_of(ch48.sac_actor_loss, one_shape(*_ACTOR), data=["alpha"])
 
 
 def _soft_value(q1, q2, lp, alpha):
     return (alpha * lp - torch.minimum(q1, q2)).mean()
 
+
+_WRONG_SAC_ACTOR_LOSS = {
+    "value-minimised": (
+        lambda q1, q2, lp, alpha: (alpha * lp + torch.minimum(q1, q2)).mean(),
+        "A loss is minimised: with +Q the policy learns the worst actions.",
+    ),
+    "entropy-minimised": (
+        lambda q1, q2, lp, alpha: (-alpha * lp - torch.minimum(q1, q2)).mean(),
+        "The entropy is -log π, and minimising -α log π makes the policy less random: the sign is wrong.",
+    ),
+    "objective-instead-of-loss": (
+        lambda q1, q2, lp, alpha: -_soft_value(q1, q2, lp, alpha),
+        "This is what the policy should maximise: a loss is minus that.",
+    ),
+    "maximum-of-the-critics": (
+        lambda q1, q2, lp, alpha: (alpha * lp - torch.maximum(q1, q2)).mean(),
+        "This is the larger of the two values: the policy would chase every overestimate.",
+    ),
+    "mean-of-the-critics": (
+        lambda q1, q2, lp, alpha: (alpha * lp - 0.5 * (q1 + q2)).mean(),
+        "This is the mean of the two values: take the smaller one, sample by sample.",
+    ),
+    "first-critic-only": (
+        lambda q1, q2, lp, alpha: (alpha * lp - q1).mean(),
+        "q2 is not used: take the smaller of the two values, sample by sample.",
+    ),
+    "minimum-of-means": (
+        lambda q1, q2, lp, alpha: (alpha * lp).mean() - torch.minimum(q1.mean(), q2.mean()),
+        "The minimum is taken for each sample, before the mean: here one critic judges the whole batch.",
+    ),
+    "alpha-missing": (
+        lambda q1, q2, lp, alpha: (lp - torch.minimum(q1, q2)).mean(),
+        "alpha is not used: it is the price of a nat of entropy in units of reward.",
+    ),
+    "entropy-missing": (
+        lambda q1, q2, lp, alpha: -torch.minimum(q1, q2).mean(),
+        "The entropy's worth is missing, and the policy's noise shrinks to nothing.",
+    ),
+    "summed": (
+        lambda q1, q2, lp, alpha: (alpha * lp - torch.minimum(q1, q2)).sum(),
+        "This is the sum over the batch: take the mean, or the step grows with the batch.",
+    ),
+    "value-detached": (
+        lambda q1, q2, lp, alpha: _soft_value(q1.detach(), q2.detach(), lp, alpha),
+        "No gradient passes through the values, which is how the policy learns what pays: to keep the critics' weights fixed,"
+        " leave them out of the optimiser, not the values out of the graph.",
+    ),
+    "log-probs-detached": (
+        lambda q1, q2, lp, alpha: _soft_value(q1, q2, lp.detach(), alpha),
+        "No gradient passes through log_probs: the policy never learns to stay random.",
+    ),
+}
 
 SAC_ACTOR_LOSS = Exercise(
     name="sac_actor_loss",
@@ -484,67 +496,7 @@ SAC_ACTOR_LOSS = Exercise(
         *shape_cases(_judged(), _ACTOR),
     ),
     misconceptions=(
-        Misconception(
-            "value-minimised",
-            _actor(lambda q1, q2, lp, alpha: (alpha * lp + torch.minimum(q1, q2)).mean()),
-            "A loss is minimised: with +Q the policy learns the worst actions.",
-        ),
-        Misconception(
-            "entropy-minimised",
-            _actor(lambda q1, q2, lp, alpha: (-alpha * lp - torch.minimum(q1, q2)).mean()),
-            "The entropy is -log π, and minimising -α log π makes the policy less random: the sign is wrong.",
-        ),
-        Misconception(
-            "objective-instead-of-loss",
-            _actor(lambda q1, q2, lp, alpha: -_soft_value(q1, q2, lp, alpha)),
-            "This is what the policy should maximise: a loss is minus that.",
-        ),
-        Misconception(
-            "maximum-of-the-critics",
-            _actor(lambda q1, q2, lp, alpha: (alpha * lp - torch.maximum(q1, q2)).mean()),
-            "This is the larger of the two values: the policy would chase every overestimate.",
-        ),
-        Misconception(
-            "mean-of-the-critics",
-            _actor(lambda q1, q2, lp, alpha: (alpha * lp - 0.5 * (q1 + q2)).mean()),
-            "This is the mean of the two values: take the smaller one, sample by sample.",
-        ),
-        Misconception(
-            "first-critic-only",
-            _actor(lambda q1, q2, lp, alpha: (alpha * lp - q1).mean()),
-            "q2 is not used: take the smaller of the two values, sample by sample.",
-        ),
-        Misconception(
-            "minimum-of-means",
-            _actor(lambda q1, q2, lp, alpha: (alpha * lp).mean() - torch.minimum(q1.mean(), q2.mean())),
-            "The minimum is taken for each sample, before the mean: here one critic judges the whole batch.",
-        ),
-        Misconception(
-            "alpha-missing",
-            _actor(lambda q1, q2, lp, alpha: (lp - torch.minimum(q1, q2)).mean()),
-            "alpha is not used: it is the price of a nat of entropy in units of reward.",
-        ),
-        Misconception(
-            "entropy-missing",
-            _actor(lambda q1, q2, lp, alpha: -torch.minimum(q1, q2).mean()),
-            "The entropy's worth is missing, and the policy's noise shrinks to nothing.",
-        ),
-        Misconception(
-            "summed",
-            _actor(lambda q1, q2, lp, alpha: (alpha * lp - torch.minimum(q1, q2)).sum()),
-            "This is the sum over the batch: take the mean, or the step grows with the batch.",
-        ),
-        Misconception(
-            "value-detached",
-            _actor(lambda q1, q2, lp, alpha: _soft_value(q1.detach(), q2.detach(), lp, alpha)),
-            "No gradient passes through the values, which is how the policy learns what pays: to keep the critics' weights fixed,"
-            " leave them out of the optimiser, not the values out of the graph.",
-        ),
-        Misconception(
-            "log-probs-detached",
-            _actor(lambda q1, q2, lp, alpha: _soft_value(q1, q2, lp.detach(), alpha)),
-            "No gradient passes through log_probs: the policy never learns to stay random.",
-        ),
+        *wrong(_WRONG_SAC_ACTOR_LOSS, _actor),
         Misconception(
             "gradient-into-alpha",
             _actor(_soft_value, leak=True),
@@ -553,7 +505,7 @@ SAC_ACTOR_LOSS = Exercise(
         cut_from_graph(ch48.sac_actor_loss),
         dtype_lost(ch48.sac_actor_loss),
         in_place(ch48.sac_actor_loss, "q1"),
-        Misconception("bad-input-accepted", _actor(_soft_value, checked=False), SHAPES),
+        bad_input_accepted(_actor(_soft_value, checked=False)),
     ),
     variants={
         "minus the soft value": _actor(lambda q1, q2, lp, alpha: -(torch.min(q1, q2) - alpha * lp).mean()),
@@ -590,6 +542,44 @@ def _temperature_by_hand(log_alpha, log_probs, target_entropy):
     return torch.tensor(-math.exp(log_alpha.item()) * (mean + target_entropy), dtype=log_probs.dtype)
 
 
+_WRONG_TEMPERATURE_LOSS = {
+    "sign-flipped": (
+        lambda log_alpha, lp, target: (log_alpha.exp() * (lp.detach() + target)).mean(),
+        "The temperature falls where it should rise: while the policy's entropy, -mean(log π), is below the target, descending"
+        " the loss must make α larger.",
+    ),
+    "log-alpha-taken-as-alpha": (
+        lambda log_alpha, lp, target: -(log_alpha * (lp.detach() + target)).mean(),
+        "α is exp(log_alpha). The loss with log α in place of α has another value and another gradient.",
+    ),
+    "target-subtracted": (
+        lambda log_alpha, lp, target: -(log_alpha.exp() * (lp.detach() - target)).mean(),
+        "The policy's entropy is -log π: the difference between the target and it is log π + target_entropy.",
+    ),
+    "target-missing": (
+        lambda log_alpha, lp, target: -(log_alpha.exp() * lp.detach()).mean(),
+        "target_entropy is not used: without it the temperature never settles.",
+    ),
+    "not-averaged": (
+        lambda log_alpha, lp, target: -(log_alpha.exp() * (lp.detach() + target)),
+        "One number is asked for: take the mean over the batch.",
+    ),
+    "summed": (
+        lambda log_alpha, lp, target: -(log_alpha.exp() * (lp.detach() + target)).sum(),
+        "This is the sum over the batch: take the mean, or the step grows with the batch.",
+    ),
+    "absolute-difference": (
+        lambda log_alpha, lp, target: log_alpha.exp() * (lp.detach().mean() + target).abs(),
+        "The sign of the difference decides whether the temperature rises or falls: without it, it only falls.",
+    ),
+    "gradient-into-the-policy": (
+        lambda log_alpha, lp, target: -(log_alpha.exp() * (lp + target)).mean(),
+        "log_probs get gradient: descending this loss would change the policy's entropy directly, in place of the temperature."
+        " Detach them.",
+    ),
+    "temperature-detached": (lambda log_alpha, lp, target: -(log_alpha.detach().exp() * (lp.detach() + target)).mean(), CUT),
+}
+
 TEMPERATURE_LOSS = Exercise(
     name="temperature_loss",
     reference=ch48.temperature_loss,
@@ -609,71 +599,19 @@ TEMPERATURE_LOSS = Exercise(
         Case("single precision", _temperature(), dtype=torch.float32, visible=True),
     ),
     misconceptions=(
-        Misconception(
-            "sign-flipped",
-            lambda log_alpha, log_probs, target_entropy: (log_alpha.exp() * (log_probs.detach() + target_entropy)).mean(),
-            "The temperature falls where it should rise: while the policy's entropy, -mean(log π), is below the target, descending"
-            " the loss must make α larger.",
-        ),
-        Misconception(
-            "log-alpha-taken-as-alpha",
-            lambda log_alpha, log_probs, target_entropy: -(log_alpha * (log_probs.detach() + target_entropy)).mean(),
-            "α is exp(log_alpha). The loss with log α in place of α has another value and another gradient.",
-        ),
-        Misconception(
-            "target-subtracted",
-            lambda log_alpha, log_probs, target_entropy: -(log_alpha.exp() * (log_probs.detach() - target_entropy)).mean(),
-            "The policy's entropy is -log π: the difference between the target and it is log π + target_entropy.",
-        ),
-        Misconception(
-            "target-missing",
-            lambda log_alpha, log_probs, target_entropy: -(log_alpha.exp() * log_probs.detach()).mean(),
-            "target_entropy is not used: without it the temperature never settles.",
-        ),
-        Misconception(
-            "not-averaged",
-            lambda log_alpha, log_probs, target_entropy: -(log_alpha.exp() * (log_probs.detach() + target_entropy)),
-            "One number is asked for: take the mean over the batch.",
-        ),
-        Misconception(
-            "summed",
-            lambda log_alpha, log_probs, target_entropy: -(log_alpha.exp() * (log_probs.detach() + target_entropy)).sum(),
-            "This is the sum over the batch: take the mean, or the step grows with the batch.",
-        ),
-        Misconception(
-            "absolute-difference",
-            lambda log_alpha, log_probs, target_entropy: log_alpha.exp() * (log_probs.detach().mean() + target_entropy).abs(),
-            "The sign of the difference decides whether the temperature rises or falls: without it, it only falls.",
-        ),
-        Misconception(
-            "gradient-into-the-policy",
-            lambda log_alpha, log_probs, target_entropy: -(log_alpha.exp() * (log_probs + target_entropy)).mean(),
-            "log_probs get gradient: descending this loss would change the policy's entropy directly, in place of the temperature."
-            " Detach them.",
-        ),
-        Misconception(
-            "temperature-detached",
-            lambda log_alpha, log_probs, target_entropy: (
-                -(log_alpha.detach().exp() * (log_probs.detach() + target_entropy)).mean()
-            ),
-            CUT,
-        ),
+        *wrong(_WRONG_TEMPERATURE_LOSS),
         python_float(ch48.temperature_loss),
         dtype_lost(ch48.temperature_loss),
         in_place(ch48.temperature_loss, "log_probs", 1),
     ),
     variants={
-        "mean first": lambda log_alpha, log_probs, target_entropy: (
-            -log_alpha.exp() * (log_probs.detach().mean() + target_entropy)
+        "mean first": lambda log_alpha, lp, target: -log_alpha.exp() * (lp.detach().mean() + target),
+        "entropy minus target": lambda log_alpha, lp, target: ((-lp.detach() - target) * torch.exp(log_alpha)).mean(),
+        "difference without gradient": lambda log_alpha, lp, target: (
+            (torch.e**log_alpha * -(lp.detach() + target)).sum() / lp.numel()
         ),
-        "entropy minus target": lambda log_alpha, log_probs, target_entropy: (
-            (-log_probs.detach() - target_entropy) * torch.exp(log_alpha)
-        ).mean(),
-        "difference without gradient": lambda log_alpha, log_probs, target_entropy: (
-            (torch.e**log_alpha * -(log_probs.detach() + target_entropy)).sum() / log_probs.numel()
-        ),
-        "sample by sample": lambda log_alpha, log_probs, target_entropy: torch.stack(
-            [-torch.exp(log_alpha) * (one + target_entropy) for one in log_probs.detach()]
+        "sample by sample": lambda log_alpha, lp, target: torch.stack(
+            [-torch.exp(log_alpha) * (one + target) for one in lp.detach()]
         ).mean(),
     },
 )
@@ -758,6 +696,52 @@ def _rebound(target, online, tau):
 
 _NAMED = ("target", "online")  # the arguments, or their tensors
 
+_WRONG_POLYAK_UPDATE = {
+    "tau-on-the-wrong-side": (
+        _polyak(lambda target, online, tau: target.lerp_(online, 1 - tau)),
+        "tau is the weight of the online parameters: with a small tau the targets move slowly, here they jump.",
+    ),
+    "copied": (
+        _polyak(lambda target, online, tau: target.copy_(online)),
+        "This copies the online parameters: the targets are to move by a share tau of the distance.",
+    ),
+    "added": (
+        _polyak(lambda target, online, tau: target.add_(tau * online)),
+        "The targets grow without bound: their old values are to be weighted with 1 - tau.",
+    ),
+    "moved-away": (
+        _polyak(lambda target, online, tau: target.sub_(tau * (online - target))),
+        "The targets move away from the online parameters: the difference has the wrong sign.",
+    ),
+    "shrunk": (
+        _polyak(lambda target, online, tau: target.mul_(1 - tau)),
+        "The online parameters' share is missing: add tau times theirs.",
+    ),
+    "weights-in-sequence": (
+        _polyak(lambda target, online, tau: target.add_(tau * online).mul_(1 - tau)),
+        "The online share is shrunk by 1 - tau as well: multiply the targets first, then add.",
+    ),
+    "not-in-place": (
+        _polyak(_rebound),
+        "target = … gives a name to a new tensor, and the network's own one stays as it is: use a method that ends in _.",
+    ),
+    "checked-and-used-up": (
+        _used_up,
+        "The check goes through the parameters, and what can be gone through once, such as net.parameters(), has nothing left for the"
+        " update: nothing moves. Do both in one loop.",
+    ),
+    "first-tensor-only": (_first_only, "Only the first tensor is moved: every pair is to be."),
+    "online-changed": (
+        _polyak(_also_online),
+        "The online parameters are changed as well: they are what is being learnt, leave them as they are.",
+    ),
+    "graph-kept": (
+        _polyak(lambda target, online, tau: target.mul_(1 - tau).add_(tau * online), graph=True),
+        "The update is recorded in the graph, which grows with every step, and PyTorch refuses to change parameters in place:"
+        " do it under torch.no_grad().",
+    ),
+}
+
 POLYAK_UPDATE = Exercise(
     name="polyak_update",
     reference=ch48.polyak_update,
@@ -786,68 +770,8 @@ POLYAK_UPDATE = Exercise(
         Case("tau = -0.1", _networks(-0.1), returns=("target_params",), raises=("tau",)),
     ),
     misconceptions=(
-        Misconception(
-            "tau-on-the-wrong-side",
-            _polyak(lambda target, online, tau: target.lerp_(online, 1 - tau)),
-            "tau is the weight of the online parameters: with a small tau the targets move slowly, here they jump.",
-        ),
-        Misconception(
-            "copied",
-            _polyak(lambda target, online, tau: target.copy_(online)),
-            "This copies the online parameters: the targets are to move by a share tau of the distance.",
-        ),
-        Misconception(
-            "added",
-            _polyak(lambda target, online, tau: target.add_(tau * online)),
-            "The targets grow without bound: their old values are to be weighted with 1 - tau.",
-        ),
-        Misconception(
-            "moved-away",
-            _polyak(lambda target, online, tau: target.sub_(tau * (online - target))),
-            "The targets move away from the online parameters: the difference has the wrong sign.",
-        ),
-        Misconception(
-            "shrunk",
-            _polyak(lambda target, online, tau: target.mul_(1 - tau)),
-            "The online parameters' share is missing: add tau times theirs.",
-        ),
-        Misconception(
-            "weights-in-sequence",
-            _polyak(lambda target, online, tau: target.add_(tau * online).mul_(1 - tau)),
-            "The online share is shrunk by 1 - tau as well: multiply the targets first, then add.",
-        ),
-        Misconception(
-            "not-in-place",
-            _polyak(_rebound),
-            "target = … gives a name to a new tensor, and the network's own one stays as it is: use a method that ends in _.",
-        ),
-        Misconception(
-            "checked-and-used-up",
-            _used_up,
-            "The check goes through the parameters, and what can be gone through once, such as net.parameters(), has nothing left for the"
-            " update: nothing moves. Do both in one loop.",
-        ),
-        Misconception(
-            "first-tensor-only",
-            _first_only,
-            "Only the first tensor is moved: every pair is to be.",
-        ),
-        Misconception(
-            "online-changed",
-            _polyak(_also_online),
-            "The online parameters are changed as well: they are what is being learnt, leave them as they are.",
-        ),
-        Misconception(
-            "graph-kept",
-            _polyak(lambda target, online, tau: target.mul_(1 - tau).add_(tau * online), graph=True),
-            "The update is recorded in the graph, which grows with every step, and PyTorch refuses to change parameters in place:"
-            " do it under torch.no_grad().",
-        ),
-        Misconception(
-            "bad-input-accepted",
-            _polyak(lambda target, online, tau: target.mul_(1 - tau).add_(tau * online), checked=False),
-            SHAPES,
-        ),
+        *wrong(_WRONG_POLYAK_UPDATE),
+        bad_input_accepted(_polyak(lambda target, online, tau: target.mul_(1 - tau).add_(tau * online), checked=False)),
     ),
     variants={
         "scaled, then added": _polyak(lambda target, online, tau: target.mul_(1 - tau).add_(online, alpha=tau)),
@@ -924,6 +848,58 @@ def _edges_in_part(x):
     return (weights * inner).sum() / weights.sum()
 
 
+_WRONG_INTERQUARTILE_MEAN = {
+    "mean": (_sorted(torch.mean), "This is the mean of all scores: one lucky run moves it."),
+    "median": (
+        _sorted(lambda x: x.quantile(0.5)),
+        "This is the median, which looks at one or two scores: the interquartile mean uses the middle half.",
+    ),
+    "whole-entries-rounded-down": (
+        _trimmed(lambda n: n // 4),
+        "Too little is cut where the count is no multiple of 4: the scores at the edges count in part, so that the weights sum"
+        " to half of the count.",
+    ),
+    "whole-entries-rounded-up": (
+        _trimmed(lambda n: -(-n // 4)),
+        "Too much is cut where the count is no multiple of 4: the scores at the edges count in part, so that the weights sum to"
+        " half of the count.",
+    ),
+    "a-quarter-in-all": (
+        _sorted(lambda x: _cut_by_weight(x, 0.125)),
+        "A quarter is cut off in all: it is a quarter at each end, which leaves half.",
+    ),
+    "upper-half": (
+        _sorted(lambda x: _cut_by_weight(x, 0.5, 0.0)),
+        "Both quarters are cut off at the lower end: the best runs are kept, and they are the lucky ones.",
+    ),
+    "mid-of-the-quartiles": (
+        _sorted(lambda x: 0.5 * (x.quantile(0.25) + x.quantile(0.75))),
+        "This is the middle between the two quartiles: the interquartile mean averages the scores between them.",
+    ),
+    "between-interpolated-quartiles": (
+        _sorted(_between_quartiles),
+        "The scores between torch.quantile's quartiles are no half of the weight: sort, and cut n / 4 at each end, the edges in part.",
+    ),
+    "not-sorted": (
+        lambda scores: _cut_by_weight(scores.flatten(), 0.25),
+        "The scores are cut in the order in which they came: sort them first.",
+    ),
+    "task-by-task": (
+        lambda scores: torch.stack(
+            [ch48.interquartile_mean(column) for column in scores.reshape(len(scores), -1).unbind(1)]
+        ).mean(),
+        "All entries are taken together: here each task is trimmed for itself, and a task without a middle counts as much.",
+    ),
+    "one-number-for-each-task": (
+        lambda scores: (
+            torch.stack([ch48.interquartile_mean(column) for column in scores.reshape(len(scores), -1).unbind(1)])
+            if scores.dim() > 1
+            else ch48.interquartile_mean(scores)
+        ),
+        "One number is asked for: flatten the scores before sorting.",
+    ),
+}
+
 INTERQUARTILE_MEAN = Exercise(
     name="interquartile_mean",
     reference=ch48.interquartile_mean,
@@ -941,66 +917,7 @@ INTERQUARTILE_MEAN = Exercise(
         Case("single precision", _scores(9), dtype=torch.float32, visible=True),
     ),
     misconceptions=(
-        Misconception("mean", _sorted(torch.mean), "This is the mean of all scores: one lucky run moves it."),
-        Misconception(
-            "median",
-            _sorted(lambda x: x.quantile(0.5)),
-            "This is the median, which looks at one or two scores: the interquartile mean uses the middle half.",
-        ),
-        Misconception(
-            "whole-entries-rounded-down",
-            _trimmed(lambda n: n // 4),
-            "Too little is cut where the count is no multiple of 4: the scores at the edges count in part, so that the weights sum"
-            " to half of the count.",
-        ),
-        Misconception(
-            "whole-entries-rounded-up",
-            _trimmed(lambda n: -(-n // 4)),
-            "Too much is cut where the count is no multiple of 4: the scores at the edges count in part, so that the weights sum to"
-            " half of the count.",
-        ),
-        Misconception(
-            "a-quarter-in-all",
-            _sorted(lambda x: _cut_by_weight(x, 0.125)),
-            "A quarter is cut off in all: it is a quarter at each end, which leaves half.",
-        ),
-        Misconception(
-            "upper-half",
-            _sorted(lambda x: _cut_by_weight(x, 0.5, 0.0)),
-            "Both quarters are cut off at the lower end: the best runs are kept, and they are the lucky ones.",
-        ),
-        Misconception(
-            "mid-of-the-quartiles",
-            _sorted(lambda x: 0.5 * (x.quantile(0.25) + x.quantile(0.75))),
-            "This is the middle between the two quartiles: the interquartile mean averages the scores between them.",
-        ),
-        Misconception(
-            "between-interpolated-quartiles",
-            _sorted(_between_quartiles),
-            "The scores between torch.quantile's quartiles are no half of the weight: sort, and cut n / 4 at each end, the edges in"
-            " part.",
-        ),
-        Misconception(
-            "not-sorted",
-            lambda scores: _cut_by_weight(scores.flatten(), 0.25),
-            "The scores are cut in the order in which they came: sort them first.",
-        ),
-        Misconception(
-            "task-by-task",
-            lambda scores: torch.stack(
-                [ch48.interquartile_mean(column) for column in scores.reshape(len(scores), -1).unbind(1)]
-            ).mean(),
-            "All entries are taken together: here each task is trimmed for itself, and a task without a middle counts as much.",
-        ),
-        Misconception(
-            "one-number-for-each-task",
-            lambda scores: (
-                torch.stack([ch48.interquartile_mean(column) for column in scores.reshape(len(scores), -1).unbind(1)])
-                if scores.dim() > 1
-                else ch48.interquartile_mean(scores)
-            ),
-            "One number is asked for: flatten the scores before sorting.",
-        ),
+        *wrong(_WRONG_INTERQUARTILE_MEAN),
         python_float(ch48.interquartile_mean),
         dtype_lost(ch48.interquartile_mean),
         in_place(ch48.interquartile_mean, "scores"),
@@ -1180,6 +1097,77 @@ def _mirrored(scores, means, low, high):
     return 2 * centre - high, 2 * centre - low
 
 
+_WRONG_BOOTSTRAP_INTERVAL = {
+    "mean-instead-of-the-interquartile-mean": (
+        _bootstrap(lambda rows: rows.mean(1)),
+        "This is an interval for the mean: bootstrap the interquartile mean.",
+    ),
+    "median-instead-of-the-interquartile-mean": (
+        _bootstrap(lambda rows: rows.quantile(0.5, dim=1)),
+        "This is an interval for the median: bootstrap the interquartile mean.",
+    ),
+    "tasks-mixed": (
+        _bootstrap(draw=_pooled),
+        "Scores are drawn from all tasks together, so that a resample may hold one task twice as often as another, and the"
+        " interval is too wide: draw seeds within each task.",
+    ),
+    "whole-rows": (
+        _bootstrap(draw=_whole_rows),
+        "The same seeds are drawn for all tasks, as if seed 3 of one task had anything to do with seed 3 of another: draw for each"
+        " task apart.",
+    ),
+    "without-replacement": (
+        _bootstrap(draw=_shuffled),
+        "Every seed is drawn once, so that all resamples are the same and the interval has no width: draw with replacement.",
+    ),
+    "half-as-many": (
+        _bootstrap(draw=_half_as_many),
+        "A resample has as many seeds as there are: with fewer the interval is too wide.",
+    ),
+    "tasks-averaged": (
+        _bootstrap(statistic=lambda rows: rows[:, 0], draw=_task_means),
+        "Each task's interquartile mean is taken for itself: it is one mean over all entries of the resample.",
+    ),
+    "tails-not-halved": (
+        _bootstrap(tails=lambda confidence: (1 - confidence, confidence)),
+        "1 - confidence is left out at each end: it is half of that, as there are two ends.",
+    ),
+    "one-sided": (
+        _bootstrap(tails=lambda confidence: (0.0, confidence)),
+        "All that is left out is left out at the upper end: leave out (1 - confidence) / 2 at either end.",
+    ),
+    "extremes": (
+        _bootstrap(tails=lambda confidence: (0.0, 1.0)),
+        "The smallest and the largest resampled mean are returned, which move apart with the number of resamples: take the quantiles.",
+    ),
+    "normal-approximation": (
+        _bootstrap(finish=_around_the_centre),
+        "Centre ± 1.96 standard deviations is symmetric and ignores `confidence`: a percentile interval takes quantiles of the"
+        " resampled means.",
+    ),
+    "mirrored": (
+        _bootstrap(finish=_mirrored),
+        "This is the basic bootstrap, which mirrors the interval at the centre: the percentile interval takes the quantiles as they are.",
+    ),
+    "ends-swapped": (_bootstrap(finish=lambda scores, means, low, high: (high, low)), "The lower end comes first."),
+    "num-resamples-ignored": (
+        lambda scores, confidence=0.95, num_resamples=2000, generator=None: _bootstrap()(scores, confidence, 2000, generator),
+        "The number of resamples is fixed: draw num_resamples of them.",
+    ),
+    "own-generator": (
+        _bootstrap(own_generator=True),
+        "Nothing is drawn from `generator`, so the interval is another one each time: hand it on to whatever draws.",
+    ),
+    "python-floats": (
+        after(ch48.bootstrap_interval, lambda interval: tuple(end.item() for end in interval)),
+        "Return 0-dim tensors, not Python floats.",
+    ),
+    "dtype-lost": (
+        after(ch48.bootstrap_interval, lambda interval: tuple(end.float() for end in interval)),
+        "The results have lost the scores' dtype.",
+    ),
+}
+
 BOOTSTRAP_INTERVAL = Exercise(
     name="bootstrap_interval",
     reference=ch48.bootstrap_interval,
@@ -1192,108 +1180,14 @@ BOOTSTRAP_INTERVAL = Exercise(
         Case("two tasks in which seeds trade places", _together, visible=True, draws=2, **_SPARE),
         Case("three tasks, all seeds alike: no width", _levels, closed_form=_certain, visible=True, **_SPARE),
         Case("a single seed: no width", _pattern((3,)), closed_form=_certain, **_SPARE),
-        Case(
-            "default settings",
-            without(_pattern(HALVES), "confidence", "num_resamples"),
-            visible=True,
-            **_SPARE,
-        ),
+        Case("default settings", without(_pattern(HALVES), "confidence", "num_resamples"), visible=True, **_SPARE),
         Case("no generator", replaced(_pattern(HALVES), generator=None), **_SPARE),
         Case("a single resample: no width", _pattern(HALVES, num_resamples=1), view="width", visible=True, **_SPARE),
         Case("what is drawn from", _pattern(HALVES, num_resamples=20), returns=("generator",), view="drawn_from", visible=True),
         Case("single precision", _pattern(HALVES), dtype=torch.float32, visible=True, **_SPARE),
     ),
     misconceptions=(
-        Misconception(
-            "mean-instead-of-the-interquartile-mean",
-            _bootstrap(lambda rows: rows.mean(1)),
-            "This is an interval for the mean: bootstrap the interquartile mean.",
-        ),
-        Misconception(
-            "median-instead-of-the-interquartile-mean",
-            _bootstrap(lambda rows: rows.quantile(0.5, dim=1)),
-            "This is an interval for the median: bootstrap the interquartile mean.",
-        ),
-        Misconception(
-            "tasks-mixed",
-            _bootstrap(draw=_pooled),
-            "Scores are drawn from all tasks together, so that a resample may hold one task twice as often as another, and the"
-            " interval is too wide: draw seeds within each task.",
-        ),
-        Misconception(
-            "whole-rows",
-            _bootstrap(draw=_whole_rows),
-            "The same seeds are drawn for all tasks, as if seed 3 of one task had anything to do with seed 3 of another: draw for each"
-            " task apart.",
-        ),
-        Misconception(
-            "without-replacement",
-            _bootstrap(draw=_shuffled),
-            "Every seed is drawn once, so that all resamples are the same and the interval has no width: draw with replacement.",
-        ),
-        Misconception(
-            "half-as-many",
-            _bootstrap(draw=_half_as_many),
-            "A resample has as many seeds as there are: with fewer the interval is too wide.",
-        ),
-        Misconception(
-            "tasks-averaged",
-            _bootstrap(statistic=lambda rows: rows[:, 0], draw=_task_means),
-            "Each task's interquartile mean is taken for itself: it is one mean over all entries of the resample.",
-        ),
-        Misconception(
-            "tails-not-halved",
-            _bootstrap(tails=lambda confidence: (1 - confidence, confidence)),
-            "1 - confidence is left out at each end: it is half of that, as there are two ends.",
-        ),
-        Misconception(
-            "one-sided",
-            _bootstrap(tails=lambda confidence: (0.0, confidence)),
-            "All that is left out is left out at the upper end: leave out (1 - confidence) / 2 at either end.",
-        ),
-        Misconception(
-            "extremes",
-            _bootstrap(tails=lambda confidence: (0.0, 1.0)),
-            "The smallest and the largest resampled mean are returned, which move apart with the number of resamples:"
-            " take the quantiles.",
-        ),
-        Misconception(
-            "normal-approximation",
-            _bootstrap(finish=_around_the_centre),
-            "Centre ± 1.96 standard deviations is symmetric and ignores `confidence`: a percentile interval takes quantiles of the"
-            " resampled means.",
-        ),
-        Misconception(
-            "mirrored",
-            _bootstrap(finish=_mirrored),
-            "This is the basic bootstrap, which mirrors the interval at the centre: the percentile interval takes the quantiles as"
-            " they are.",
-        ),
-        Misconception(
-            "ends-swapped",
-            _bootstrap(finish=lambda scores, means, low, high: (high, low)),
-            "The lower end comes first.",
-        ),
-        Misconception(
-            "num-resamples-ignored",
-            lambda scores, confidence=0.95, num_resamples=2000, generator=None: _bootstrap()(scores, confidence, 2000, generator),
-            "The number of resamples is fixed: draw num_resamples of them.",
-        ),
-        Misconception(
-            "own-generator",
-            _bootstrap(own_generator=True),
-            "Nothing is drawn from `generator`, so the interval is another one each time: hand it on to whatever draws.",
-        ),
-        Misconception(
-            "python-floats",
-            after(ch48.bootstrap_interval, lambda interval: tuple(end.item() for end in interval)),
-            "Return 0-dim tensors, not Python floats.",
-        ),
-        Misconception(
-            "dtype-lost",
-            after(ch48.bootstrap_interval, lambda interval: tuple(end.float() for end in interval)),
-            "The results have lost the scores' dtype.",
-        ),
+        *wrong(_WRONG_BOOTSTRAP_INTERVAL),
         in_place(ch48.bootstrap_interval, "scores"),
     ),
     variants={
@@ -1331,22 +1225,22 @@ def _motor_steps(size=6, dims=2, low=(-1.0, 0.5), high=(3.0, 1.5), reach=1.0):
     return inputs
 
 
+_rewritten = versions_of(
+    ch48.repaired_transitions,
+    satisfies(lambda obs, sent, rewards, next_obs: len(obs) == len(sent) == len(rewards) == len(next_obs)),
+    one_shape("rewards", "terminated", "truncated"),
+    satisfies(lambda low, high: (low < high).all()),
+)
+
+
 def _kept(actions=None, ended=lambda terminated, truncated: terminated, checked=True, **columns):
     """A version: `actions(sent, low, high)` are those that are kept."""
 
     def version(obs, sent, rewards, next_obs, terminated, truncated, low, high):
-        if checked:
-            for name, rows in {"sent": sent, "rewards": rewards, "next_obs": next_obs, "terminated": terminated}.items():
-                if rows.shape[0] != obs.shape[0]:
-                    raise ValueError(f"{name} has {rows.shape[0]} rows, obs {obs.shape[0]}")
-            if truncated.shape != terminated.shape:
-                raise ValueError(f"truncated is {tuple(truncated.shape)}, terminated {tuple(terminated.shape)}")
-            if (high <= low).any():
-                raise ValueError(f"low must lie below high, got {low} and {high}")
         kept = Transitions(obs, (actions or _as_sampled)(sent, low, high), rewards, next_obs, ended(terminated, truncated))
         return kept._replace(**{name: change(kept) for name, change in columns.items()})
 
-    return version
+    return _rewritten(version, checked)
 
 
 def _as_sampled(sent, low, high):
@@ -1365,6 +1259,64 @@ def _by_interpolation(sent, low, high):
 
 
 _STUCK = torch.tensor([3.0, 0.5], dtype=torch.float64)  # the second motor's low, too
+
+_WRONG_REPAIRED_TRANSITIONS = {
+    "as-sent": (
+        _kept(lambda sent, low, high: sent.clone()),
+        "The buffer keeps what the environment was sent. The policy's actions lie in (-1, 1), and the critic is asked about those: it"
+        " has to be taught about actions on the same scale.",
+    ),
+    "as-clipped": (
+        _kept(lambda sent, low, high: sent.clamp(-1, 1)),
+        "Clipping commands to [-1, 1] makes many of them one and the same action, and moves none to where the policy meant it:"
+        " undo the scaling.",
+    ),
+    "to-the-unit-interval": (
+        _kept(lambda sent, low, high: (sent - low) / (high - low)),
+        "These actions lie in [0, 1]: half of the range that the policy chooses from is missing.",
+    ),
+    "divided-by-the-upper-bound": (
+        _kept(lambda sent, low, high: sent / high),
+        "Dividing by the upper bound is right only for bounds that are symmetric around 0.",
+    ),
+    "not-centred": (
+        _kept(lambda sent, low, high: 2 * sent / (high - low)),
+        "The middle of the motor's range is the policy's 0: subtract it before you scale.",
+    ),
+    "not-scaled": (
+        _kept(lambda sent, low, high: sent - 0.5 * (low + high)),
+        "The commands are centred, but not scaled: half of the range is 1.",
+    ),
+    "half-the-scale": (
+        _kept(lambda sent, low, high: (sent - 0.5 * (low + high)) / (high - low)),
+        "Divide by half of the range: these actions reach only from -0.5 to 0.5.",
+    ),
+    "upside-down": (
+        _kept(lambda sent, low, high: 1 - 2 * (sent - low) / (high - low)),
+        "The lower bound is the policy's -1, the upper one its 1: these are exchanged.",
+    ),
+    "one-motor's-bounds-for-all": (
+        _kept(lambda sent, low, high: 2 * (sent - low[0]) / (high[0] - low[0]) - 1),
+        "Every motor has bounds of its own: low and high are (A,), and broadcast over the steps.",
+    ),
+    "before-squashing": (
+        _kept(lambda sent, low, high: _as_sampled(sent, low, high).clamp(-1 + 1e-6, 1 - 1e-6).atanh()),
+        "The critic is asked about actions after the hyperbolic tangent, in (-1, 1), not about pre-activations.",
+    ),
+    "truncated-taken-for-terminated": (
+        _kept(ended=lambda terminated, truncated: terminated | truncated),
+        "A time limit is no end of the task: the critic's target goes on there.",
+    ),
+    "truncated-instead-of-terminated": (
+        _kept(ended=lambda terminated, truncated: truncated),
+        "`terminated` is what ends the target. The time limit does not.",
+    ),
+    "successor-lost": (_kept(next_obs=lambda kept: kept.obs), "next_obs is what the step led to, not what was seen before it."),
+    "dtype-lost": (
+        after(ch48.repaired_transitions, lambda kept: kept._replace(actions=kept.actions.half())),
+        "The actions have lost the dtype of what was sent.",
+    ),
+}
 
 REPAIRED_TRANSITIONS = Exercise(
     name="repaired_transitions",
@@ -1385,80 +1337,9 @@ REPAIRED_TRANSITIONS = Exercise(
         *shape_cases(_motor_steps(), _ROWS),
     ),
     misconceptions=(
-        Misconception(
-            "as-sent",
-            _kept(lambda sent, low, high: sent.clone()),
-            "The buffer keeps what the environment was sent. The policy's actions lie in (-1, 1), and the critic is asked about those: it"
-            " has to be taught about actions on the same scale.",
-        ),
-        Misconception(
-            "as-clipped",
-            _kept(lambda sent, low, high: sent.clamp(-1, 1)),
-            "Clipping commands to [-1, 1] makes many of them one and the same action, and moves none to where the policy meant it:"
-            " undo the scaling.",
-        ),
-        Misconception(
-            "to-the-unit-interval",
-            _kept(lambda sent, low, high: (sent - low) / (high - low)),
-            "These actions lie in [0, 1]: half of the range that the policy chooses from is missing.",
-        ),
-        Misconception(
-            "divided-by-the-upper-bound",
-            _kept(lambda sent, low, high: sent / high),
-            "Dividing by the upper bound is right only for bounds that are symmetric around 0.",
-        ),
-        Misconception(
-            "not-centred",
-            _kept(lambda sent, low, high: 2 * sent / (high - low)),
-            "The middle of the motor's range is the policy's 0: subtract it before you scale.",
-        ),
-        Misconception(
-            "not-scaled",
-            _kept(lambda sent, low, high: sent - 0.5 * (low + high)),
-            "The commands are centred, but not scaled: half of the range is 1.",
-        ),
-        Misconception(
-            "half-the-scale",
-            _kept(lambda sent, low, high: (sent - 0.5 * (low + high)) / (high - low)),
-            "Divide by half of the range: these actions reach only from -0.5 to 0.5.",
-        ),
-        Misconception(
-            "upside-down",
-            _kept(lambda sent, low, high: 1 - 2 * (sent - low) / (high - low)),
-            "The lower bound is the policy's -1, the upper one its 1: these are exchanged.",
-        ),
-        Misconception(
-            "one-motor's-bounds-for-all",
-            _kept(lambda sent, low, high: 2 * (sent - low[0]) / (high[0] - low[0]) - 1),
-            "Every motor has bounds of its own: low and high are (A,), and broadcast over the steps.",
-        ),
-        Misconception(
-            "before-squashing",
-            _kept(lambda sent, low, high: _as_sampled(sent, low, high).clamp(-1 + 1e-6, 1 - 1e-6).atanh()),
-            "The critic is asked about actions after the hyperbolic tangent, in (-1, 1), not about pre-activations.",
-        ),
-        Misconception(
-            "truncated-taken-for-terminated",
-            _kept(ended=lambda terminated, truncated: terminated | truncated),
-            "A time limit is no end of the task: the critic's target goes on there.",
-        ),
-        Misconception(
-            "truncated-instead-of-terminated",
-            _kept(ended=lambda terminated, truncated: truncated),
-            "`terminated` is what ends the target. The time limit does not.",
-        ),
-        Misconception(
-            "successor-lost",
-            _kept(next_obs=lambda kept: kept.obs),
-            "next_obs is what the step led to, not what was seen before it.",
-        ),
-        Misconception(
-            "dtype-lost",
-            after(ch48.repaired_transitions, lambda kept: kept._replace(actions=kept.actions.half())),
-            "The actions have lost the dtype of what was sent.",
-        ),
+        *wrong(_WRONG_REPAIRED_TRANSITIONS),
         in_place(ch48.repaired_transitions, "sent", 1),
-        Misconception("bad-input-accepted", _kept(checked=False), SHAPES),
+        bad_input_accepted(_kept(checked=False)),
     ),
     variants={
         "from the lower bound": _kept(),
