@@ -10,19 +10,23 @@ from torch.distributions import Normal
 from torch.nn import functional
 
 from autograder.authoring.parts import (
-    CUT,
-    IN_PLACE,
-    SHAPES,
     after,
+    bad_input_accepted,
+    cut_from_graph,
     drawn_once,
     dtype_lost,
     in_place,
     normal,
+    number,
+    one_shape,
     python_float,
     refused,
     reshaped,
+    satisfies,
     shape_cases,
     uniform,
+    versions_of,
+    wrong,
 )
 from autograder.authoring.spec import Case, Exercise, Misconception
 from course_lib.checks.cases import built
@@ -66,16 +70,12 @@ def _nll_by_hand(mean, log_var, targets):
     return torch.tensor(sum(terms) / len(terms), dtype=mean.dtype)
 
 
-def _nll(formula, checked=True, leak=False):
-    def version(mean, log_var, targets):
-        if checked:
-            if mean.shape != log_var.shape:
-                raise ValueError(f"mean {tuple(mean.shape)} and log_var {tuple(log_var.shape)} must be alike")
-            if tuple(targets.shape) not in (tuple(mean.shape), tuple(mean.shape[1:])):
-                raise ValueError(f"targets of shape {tuple(targets.shape)} do not belong to a mean of {tuple(mean.shape)}")
-        return formula(mean, log_var, targets if leak else targets.detach())
-
-    return version
+_nll = versions_of(
+    ch51.gaussian_nll,
+    one_shape("mean", "log_var"),
+    satisfies(lambda targets, mean: targets.shape in (mean.shape, mean.shape[1:])),
+    data=["targets"],
+)
 
 
 def _terms(m, s, y):
@@ -88,6 +88,72 @@ def _averaged_prediction(m, s, y):
     return _terms(m.mean(0), s.exp().mean(0).log(), y).mean()
 
 
+_WRONG_GAUSSIAN_NLL = {
+    "squared-error": (
+        lambda m, s, y: (y - m).square().mean(),
+        "This is the squared error: a model that knows how sure it is divides it by its variance and pays log σ².",
+    ),
+    "log-variance-missing": (
+        lambda m, s, y: 0.5 * ((y - m) ** 2 / s.exp() + LOG_TWO_PI).mean(),
+        "Without the term log σ² the loss falls as the variance grows, for ever: the model learns to be sure of nothing.",
+    ),
+    "log-variance-with-the-wrong-sign": (
+        lambda m, s, y: 0.5 * (-s + (y - m) ** 2 / s.exp() + LOG_TWO_PI).mean(),
+        "A wide distribution is a low one: log σ² is added to the loss.",
+    ),
+    "error-multiplied-by-the-variance": (
+        lambda m, s, y: 0.5 * (s + (y - m) ** 2 * s.exp() + LOG_TWO_PI).mean(),
+        "The squared error is divided by the variance, that is, multiplied by exp(-log_var).",
+    ),
+    "log-var-taken-as-log-std": (
+        lambda m, s, y: 0.5 * (2 * s + (y - m) ** 2 / (2 * s).exp() + LOG_TWO_PI).mean(),
+        "log_var is log σ², not log σ: the variance is exp(log_var).",
+    ),
+    "log-var-taken-as-variance": (
+        lambda m, s, y: 0.5 * (s.abs().log() + (y - m) ** 2 / s + LOG_TWO_PI).mean(),
+        "log_var is the logarithm of the variance: take its exponential.",
+    ),
+    "error-not-squared": (
+        lambda m, s, y: 0.5 * (s + (y - m).abs() / s.exp() + LOG_TWO_PI).mean(),
+        "The exponent of the normal density has the error squared.",
+    ),
+    "half-missing": (
+        lambda m, s, y: (s + (y - m) ** 2 / s.exp() + LOG_TWO_PI).mean(),
+        "This is twice the negative log-likelihood: the half is missing.",
+    ),
+    "half-of-the-error-only": (
+        lambda m, s, y: (s + 0.5 * (y - m) ** 2 / s.exp() + 0.5 * LOG_TWO_PI).mean(),
+        "log σ is half of log σ²: log_var has no half here, and the variances come out too small.",
+    ),
+    "two-pi-missing": (
+        lambda m, s, y: 0.5 * (s + (y - m) ** 2 / s.exp()).mean(),
+        "The constant ½ log 2π is missing: it moves no gradient, but what is reported is no likelihood.",
+    ),
+    "likelihood": (lambda m, s, y: -_terms(m, s, y).mean(), "This is the log-likelihood: a loss is minus that."),
+    "summed-over-dimensions": (
+        lambda m, s, y: _terms(m, s, y).sum(-1).mean(),
+        "The mean over every element is asked for: here the dimensions are summed.",
+    ),
+    "summed-over-members": (
+        lambda m, s, y: _terms(m, s, y).mean((1, 2)).sum(),
+        "The mean over every element is asked for: here the members are summed.",
+    ),
+    "summed": (lambda m, s, y: _terms(m, s, y).sum(), "This is a sum: the mean over every element is asked for."),
+    "one-loss-for-each-member": (
+        lambda m, s, y: _terms(m, s, y).mean((1, 2)),
+        "One number is asked for: the mean over the members as well.",
+    ),
+    "ensemble-averaged-first": (
+        _averaged_prediction,
+        "The members' predictions are averaged before they are judged. Then only the average has to be right, and their"
+        " disagreement no longer says where the model is unsure: each member is to be judged for itself.",
+    ),
+    "variance-detached": (
+        lambda m, s, y: _terms(m, s.detach(), y).mean(),
+        "No gradient reaches log_var: the model never learns how sure it may be.",
+    ),
+}
+
 GAUSSIAN_NLL = Exercise(
     name="gaussian_nll",
     reference=ch51.gaussian_nll,
@@ -95,23 +161,14 @@ GAUSSIAN_NLL = Exercise(
     cases=drawn_once(
         Case("three members, targets for all", _ensemble(), closed_form=_nll_by_hand, visible=True, draws=2),
         Case("three members, samples of their own", _ensemble(own_samples=True), closed_form=_nll_by_hand, visible=True, draws=2),
-        Case(
-            "right, with variance 1: half of log 2π",
-            _standard_and_right,
-            closed_form=lambda mean, **_rest: torch.tensor(0.5 * LOG_TWO_PI, dtype=mean.dtype),
-            visible=True,
-        ),
+        Case("right, with variance 1: half of log 2π", _standard_and_right, closed_form=number(0.5 * LOG_TWO_PI), visible=True),
         Case("as many members as samples", _ensemble(4, 4, 2), closed_form=_nll_by_hand),
         Case("a single member", _ensemble(1, 6, 2), closed_form=_nll_by_hand),
         Case("members that are very sure, or not at all", _extremes, closed_form=_nll_by_hand),
         Case("all inputs require gradient", _ensemble(), differentiate=_PREDICTED, visible=True, draws=2),
         Case("own samples, gradient", _ensemble(own_samples=True), differentiate=_PREDICTED),
         Case("single precision", _ensemble(), dtype=torch.float32, visible=True),
-        Case(
-            "log_var without its first member",
-            reshaped(_ensemble(), "log_var", lambda x: x[1:]),
-            raises=("log_var", "mean"),
-        ),
+        Case("log_var without its first member", reshaped(_ensemble(), "log_var", lambda x: x[1:]), raises=("log_var", "mean")),
         Case(
             "log_var the same for all members",
             reshaped(_ensemble(), "log_var", lambda x: x[:1]),
@@ -127,99 +184,14 @@ GAUSSIAN_NLL = Exercise(
         Case("targets of one sample", reshaped(_ensemble(), "targets", lambda x: x[:1]), raises=("targets", "mean")),
     ),
     misconceptions=(
-        Misconception(
-            "squared-error",
-            _nll(lambda m, s, y: (y - m).square().mean()),
-            "This is the squared error: a model that knows how sure it is divides it by its variance and pays log σ².",
-        ),
-        Misconception(
-            "log-variance-missing",
-            _nll(lambda m, s, y: 0.5 * ((y - m) ** 2 / s.exp() + LOG_TWO_PI).mean()),
-            "Without the term log σ² the loss falls as the variance grows, for ever: the model learns to be sure of nothing.",
-        ),
-        Misconception(
-            "log-variance-with-the-wrong-sign",
-            _nll(lambda m, s, y: 0.5 * (-s + (y - m) ** 2 / s.exp() + LOG_TWO_PI).mean()),
-            "A wide distribution is a low one: log σ² is added to the loss.",
-        ),
-        Misconception(
-            "error-multiplied-by-the-variance",
-            _nll(lambda m, s, y: 0.5 * (s + (y - m) ** 2 * s.exp() + LOG_TWO_PI).mean()),
-            "The squared error is divided by the variance, that is, multiplied by exp(-log_var).",
-        ),
-        Misconception(
-            "log-var-taken-as-log-std",
-            _nll(lambda m, s, y: 0.5 * (2 * s + (y - m) ** 2 / (2 * s).exp() + LOG_TWO_PI).mean()),
-            "log_var is log σ², not log σ: the variance is exp(log_var).",
-        ),
-        Misconception(
-            "log-var-taken-as-variance",
-            _nll(lambda m, s, y: 0.5 * (s.abs().log() + (y - m) ** 2 / s + LOG_TWO_PI).mean()),
-            "log_var is the logarithm of the variance: take its exponential.",
-        ),
-        Misconception(
-            "error-not-squared",
-            _nll(lambda m, s, y: 0.5 * (s + (y - m).abs() / s.exp() + LOG_TWO_PI).mean()),
-            "The exponent of the normal density has the error squared.",
-        ),
-        Misconception(
-            "half-missing",
-            _nll(lambda m, s, y: (s + (y - m) ** 2 / s.exp() + LOG_TWO_PI).mean()),
-            "This is twice the negative log-likelihood: the half is missing.",
-        ),
-        Misconception(
-            "half-of-the-error-only",
-            _nll(lambda m, s, y: (s + 0.5 * (y - m) ** 2 / s.exp() + 0.5 * LOG_TWO_PI).mean()),
-            "log σ is half of log σ²: log_var has no half here, and the variances come out too small.",
-        ),
-        Misconception(
-            "two-pi-missing",
-            _nll(lambda m, s, y: 0.5 * (s + (y - m) ** 2 / s.exp()).mean()),
-            "The constant ½ log 2π is missing: it moves no gradient, but what is reported is no likelihood.",
-        ),
-        Misconception(
-            "likelihood",
-            _nll(lambda m, s, y: -_terms(m, s, y).mean()),
-            "This is the log-likelihood: a loss is minus that.",
-        ),
-        Misconception(
-            "summed-over-dimensions",
-            _nll(lambda m, s, y: _terms(m, s, y).sum(-1).mean()),
-            "The mean over every element is asked for: here the dimensions are summed.",
-        ),
-        Misconception(
-            "summed-over-members",
-            _nll(lambda m, s, y: _terms(m, s, y).mean((1, 2)).sum()),
-            "The mean over every element is asked for: here the members are summed.",
-        ),
-        Misconception(
-            "summed",
-            _nll(lambda m, s, y: _terms(m, s, y).sum()),
-            "This is a sum: the mean over every element is asked for.",
-        ),
-        Misconception(
-            "one-loss-for-each-member",
-            _nll(lambda m, s, y: _terms(m, s, y).mean((1, 2))),
-            "One number is asked for: the mean over the members as well.",
-        ),
-        Misconception(
-            "ensemble-averaged-first",
-            _nll(_averaged_prediction),
-            "The members' predictions are averaged before they are judged. Then only the average has to be right, and their"
-            " disagreement no longer says where the model is unsure: each member is to be judged for itself.",
-        ),
-        Misconception(
-            "variance-detached",
-            _nll(lambda m, s, y: _terms(m, s.detach(), y).mean()),
-            "No gradient reaches log_var: the model never learns how sure it may be.",
-        ),
+        *wrong(_WRONG_GAUSSIAN_NLL, _nll),
         Misconception(
             "gradient-into-targets", _nll(lambda m, s, y: _terms(m, s, y).mean(), leak=True), "Targets are data: detach them."
         ),
         python_float(ch51.gaussian_nll),
         dtype_lost(ch51.gaussian_nll),
         in_place(ch51.gaussian_nll, "mean"),
-        Misconception("bad-input-accepted", _nll(lambda m, s, y: _terms(m, s, y).mean(), checked=False), SHAPES),
+        bad_input_accepted(_nll(lambda m, s, y: _terms(m, s, y).mean(), checked=False)),
     ),
     variants={
         "torch.distributions": _nll(lambda m, s, y: -Normal(m, (0.5 * s).exp()).log_prob(y).mean()),
@@ -382,15 +354,51 @@ def _recursive(model, policy, start_obs, horizon, generator):
     return _stacked([start_obs, *obs], actions, rewards, continues)
 
 
-def _in_place_at_the_end(model, policy, start_obs, horizon, generator):
-    result = ch51.imagine(model, policy, start_obs, horizon, generator)
-    start_obs.copy_(result["obs"][-1])
-    return result
-
-
 def _delayed(continues):
     return torch.cat([torch.ones_like(continues[:1]), continues[:-1]])
 
+
+_WRONG_IMAGINE = {
+    "always-from-the-start": (
+        _dream(condition=lambda start, latest: start),
+        "Every step begins at start_obs again: the next one begins where the last one led to.",
+    ),
+    "end-forgotten": (
+        _dream(ends=lambda alive, goes_on: goes_on),
+        "A trajectory that has ended comes back to life as soon as the model finds its state harmless: once continues is 0, it stays 0.",
+    ),
+    "end-a-step-late": (
+        _dream(finish=lambda result: result | {"continues": _delayed(result["continues"])}),
+        "continues[t] says whether the trajectory goes on after step t, not whether it had ended before it.",
+    ),
+    "never-ends": (_dream(ends=lambda alive, goes_on: alive), "What the model says about the end is not used."),
+    "ends-instead-of-continues": (
+        _dream(finish=lambda result: result | {"continues": 1 - result["continues"]}),
+        "This is 1 where the trajectory has ended: continues is 1 where it goes on.",
+    ),
+    "all-end-together": (
+        _dream(ends=lambda alive, goes_on: alive * goes_on.min()),
+        "Where one trajectory ends, all do here: each has its own end.",
+    ),
+    "start-left-out": (_dream(finish=_without_start), "obs begins with start_obs: it has H + 1 entries."),
+    "last-state-left-out": (
+        _dream(finish=_without_end),
+        "The state that the last step led to is missing: obs has H + 1 entries, and the last value is bootstrapped from it.",
+    ),
+    "batch-first": (_dream(finish=_batch_first), "Time comes first: (H, B), not (B, H)."),
+    "policy-asked-twice": (
+        _dream(before=lambda model, policy, obs, generator: policy(obs, generator)),
+        "The policy is called more than once in a step: what is recorded must be the action that the model was given.",
+    ),
+    "trajectory-by-trajectory": (
+        _row_by_row,
+        "The model is called for each trajectory apart: one call for the whole batch does the same in a fraction of the time.",
+    ),
+    "dtype-lost": (
+        after(ch51.imagine, lambda result: {name: column.float() for name, column in result.items()}),
+        "The results have lost the dtype of start_obs.",
+    ),
+}
 
 IMAGINE = Exercise(
     name="imagine",
@@ -409,68 +417,8 @@ IMAGINE = Exercise(
         _view("single precision", _dreams(), dtype=torch.float32, visible=True),
     ),
     misconceptions=(
-        Misconception(
-            "always-from-the-start",
-            _dream(condition=lambda start, latest: start),
-            "Every step begins at start_obs again: the next one begins where the last one led to.",
-        ),
-        Misconception(
-            "end-forgotten",
-            _dream(ends=lambda alive, goes_on: goes_on),
-            "A trajectory that has ended comes back to life as soon as the model finds its state harmless: once continues is 0, it"
-            " stays 0.",
-        ),
-        Misconception(
-            "end-a-step-late",
-            _dream(finish=lambda result: result | {"continues": _delayed(result["continues"])}),
-            "continues[t] says whether the trajectory goes on after step t, not whether it had ended before it.",
-        ),
-        Misconception(
-            "never-ends",
-            _dream(ends=lambda alive, goes_on: alive),
-            "What the model says about the end is not used.",
-        ),
-        Misconception(
-            "ends-instead-of-continues",
-            _dream(finish=lambda result: result | {"continues": 1 - result["continues"]}),
-            "This is 1 where the trajectory has ended: continues is 1 where it goes on.",
-        ),
-        Misconception(
-            "all-end-together",
-            _dream(ends=lambda alive, goes_on: alive * goes_on.min()),
-            "Where one trajectory ends, all do here: each has its own end.",
-        ),
-        Misconception("start-left-out", _dream(finish=_without_start), "obs begins with start_obs: it has H + 1 entries."),
-        Misconception(
-            "last-state-left-out",
-            _dream(finish=_without_end),
-            "The state that the last step led to is missing: obs has H + 1 entries, and the last value is bootstrapped from it.",
-        ),
-        Misconception(
-            "batch-first",
-            _dream(finish=_batch_first),
-            "Time comes first: (H, B), not (B, H).",
-        ),
-        Misconception(
-            "policy-asked-twice",
-            _dream(before=lambda model, policy, obs, generator: policy(obs, generator)),
-            "The policy is called more than once in a step: what is recorded must be the action that the model was given.",
-        ),
-        Misconception(
-            "trajectory-by-trajectory",
-            _row_by_row,
-            "The model is called for each trajectory apart: one call for the whole batch does the same in a fraction of the time.",
-        ),
-        Misconception(
-            "dtype-lost",
-            after(ch51.imagine, lambda result: {name: column.float() for name, column in result.items()}),
-            "The results have lost the dtype of start_obs.",
-        ),
-        Misconception(
-            "input-changed",
-            _in_place_at_the_end,
-            IN_PLACE,
-        ),
+        *wrong(_WRONG_IMAGINE),
+        in_place(ch51.imagine, "start_obs", 2),
     ),
     variants={
         "into arrays made before": _filled,
@@ -532,18 +480,12 @@ def _one_step(rewards, values, continues, gamma, **_rest):
     return rewards + gamma * continues * values
 
 
-def _dreamer(formula, checked=True):
-    def version(rewards, values, continues, gamma, lam):
-        if checked:
-            if not rewards.shape == values.shape == continues.shape:
-                shapes = [tuple(x.shape) for x in (rewards, values, continues)]
-                raise ValueError(f"rewards, values and continues must be of one shape, not {shapes}")
-            for name, value in (("gamma", gamma), ("lam", lam)):
-                if value < 0 or value > 1:
-                    raise ValueError(f"{name} = {value} is outside [0, 1]")
-        return formula(rewards, values, continues, gamma, lam)
-
-    return version
+_dreamer = versions_of(
+    ch51.dreamer_lambda_returns,
+    one_shape(*_IMAGINED),
+    satisfies(lambda gamma: 0 <= gamma <= 1),
+    satisfies(lambda lam: 0 <= lam <= 1),
+)
 
 
 def _backwards(mix, last=lambda v: v[-1]):
@@ -600,6 +542,77 @@ def _by_matrix(r, v, c, gamma, lam):
     return torch.stack(columns, 1)
 
 
+_WRONG_DREAMER_LAMBDA_RETURNS = {
+    "values-of-the-state-before": (
+        _values_of_the_same_state,
+        "values[t] belongs to the state that rewards[t] led to: it is what bootstraps step t. Here values[t + 1] does.",
+    ),
+    "last-value-forgotten": (
+        _backwards(_right, last=lambda v: torch.zeros_like(v[-1])),
+        "Behind the horizon stands nothing here: the last return bootstraps from values[-1] alone, with no 1 - λ before it.",
+    ),
+    "no-bootstrap-at-the-end": (
+        lambda r, v, c, gamma, lam: (
+            torch.cat([_backwards(_right)(r[:-1], v[:-1], c[:-1], gamma, lam), r[-1:]]) if len(r) > 1 else r.clone()
+        ),
+        "The last return is its reward only: it bootstraps from values[-1], and the returns before it go on from there.",
+    ),
+    "lam-swapped": (
+        _backwards(lambda r, v, c, f, gamma, lam: _right(r, v, c, f, gamma, 1 - lam)),
+        "λ weights the longer return and 1 - λ the value: here it is the other way round.",
+    ),
+    "end-ignored": (
+        _backwards(lambda r, v, c, f, gamma, lam: _right(r, v, 1.0, f, gamma, lam)),
+        "continues is not used: where a trajectory has ended nothing follows.",
+    ),
+    "end-stops-the-recursion-only": (
+        _backwards(lambda r, v, c, f, gamma, lam: r + gamma * ((1 - lam) * v + lam * c * f)),
+        "After an end the value is still bootstrapped: continues multiplies both, the value and the return that follows.",
+    ),
+    "end-stops-the-value-only": (
+        _backwards(lambda r, v, c, f, gamma, lam: r + gamma * ((1 - lam) * c * v + lam * f)),
+        "After an end the following returns still count: continues multiplies both, the value and the return that follows.",
+    ),
+    "end-of-the-next-step": (
+        lambda r, v, c, gamma, lam: _backwards(_right)(r, v, torch.cat([c[1:], torch.ones_like(c[:1])]), gamma, lam),
+        "continues[t] belongs to step t: here that of step t + 1 is used.",
+    ),
+    "end-taken-as-flag": (
+        lambda r, v, c, gamma, lam: _backwards(_right)(r, v, (c > 0.5).to(r.dtype), gamma, lam),
+        "continues may be a probability: multiply by it, do not round it.",
+    ),
+    "gamma-missing": (
+        _backwards(lambda r, v, c, f, gamma, lam: _right(r, v, c, f, 1.0, lam)),
+        "What follows is not discounted: multiply it by gamma.",
+    ),
+    "gamma-on-the-return-only": (
+        _backwards(lambda r, v, c, f, gamma, lam: r + c * ((1 - lam) * v + gamma * lam * f)),
+        "gamma multiplies both: the value is one step away, too.",
+    ),
+    "weights-do-not-sum-to-one": (
+        _backwards(lambda r, v, c, f, gamma, lam: r + gamma * c * (v + lam * f)),
+        "The value has the weight 1 - λ: with 1 what follows is counted 1 + λ times.",
+    ),
+    "lam-missing": (
+        _backwards(lambda r, v, c, f, gamma, lam: _right(r, v, c, f, gamma, 1.0)),
+        "lam is not used: these are the sums of all rewards.",
+    ),
+    "one-step-only": (lambda r, v, c, gamma, lam: r + gamma * c * v, "lam is not used: these are one-step targets."),
+    "advantages": (
+        lambda r, v, c, gamma, lam: _backwards(_right)(r, v, c, gamma, lam) - v,
+        "values are subtracted: the returns themselves are asked for.",
+    ),
+    "forwards": (_forwards, "Time runs the wrong way: a return depends on what comes after, so begin with the last step."),
+    "order-reversed": (
+        lambda r, v, c, gamma, lam: _backwards(_right)(r, v, c, gamma, lam).flip(0),
+        "The returns come in the order in which they were computed, last step first: turn them round.",
+    ),
+    "values-detached": (
+        lambda r, v, c, gamma, lam: _backwards(_right)(r, v.detach(), c, gamma, lam),
+        "No gradient reaches values: Dreamer's policy learns through them what lies behind the horizon.",
+    ),
+}
+
 DREAMER_LAMBDA_RETURNS = Exercise(
     name="dreamer_lambda_returns",
     reference=ch51.dreamer_lambda_returns,
@@ -624,106 +637,11 @@ DREAMER_LAMBDA_RETURNS = Exercise(
         refused(_imagined(), lam=1.5),
     ),
     misconceptions=(
-        Misconception(
-            "values-of-the-state-before",
-            _dreamer(_values_of_the_same_state),
-            "values[t] belongs to the state that rewards[t] led to: it is what bootstraps step t. Here values[t + 1] does.",
-        ),
-        Misconception(
-            "last-value-forgotten",
-            _dreamer(_backwards(_right, last=lambda v: torch.zeros_like(v[-1]))),
-            "Behind the horizon stands nothing here: the last return bootstraps from values[-1] alone, with no 1 - λ before it.",
-        ),
-        Misconception(
-            "no-bootstrap-at-the-end",
-            _dreamer(
-                lambda r, v, c, gamma, lam: (
-                    torch.cat([_backwards(_right)(r[:-1], v[:-1], c[:-1], gamma, lam), r[-1:]]) if len(r) > 1 else r.clone()
-                )
-            ),
-            "The last return is its reward only: it bootstraps from values[-1], and the returns before it go on from there.",
-        ),
-        Misconception(
-            "lam-swapped",
-            _dreamer(_backwards(lambda r, v, c, f, gamma, lam: _right(r, v, c, f, gamma, 1 - lam))),
-            "λ weights the longer return and 1 - λ the value: here it is the other way round.",
-        ),
-        Misconception(
-            "end-ignored",
-            _dreamer(_backwards(lambda r, v, c, f, gamma, lam: _right(r, v, 1.0, f, gamma, lam))),
-            "continues is not used: where a trajectory has ended nothing follows.",
-        ),
-        Misconception(
-            "end-stops-the-recursion-only",
-            _dreamer(_backwards(lambda r, v, c, f, gamma, lam: r + gamma * ((1 - lam) * v + lam * c * f))),
-            "After an end the value is still bootstrapped: continues multiplies both, the value and the return that follows.",
-        ),
-        Misconception(
-            "end-stops-the-value-only",
-            _dreamer(_backwards(lambda r, v, c, f, gamma, lam: r + gamma * ((1 - lam) * c * v + lam * f))),
-            "After an end the following returns still count: continues multiplies both, the value and the return that follows.",
-        ),
-        Misconception(
-            "end-of-the-next-step",
-            _dreamer(
-                lambda r, v, c, gamma, lam: _backwards(_right)(r, v, torch.cat([c[1:], torch.ones_like(c[:1])]), gamma, lam)
-            ),
-            "continues[t] belongs to step t: here that of step t + 1 is used.",
-        ),
-        Misconception(
-            "end-taken-as-flag",
-            _dreamer(lambda r, v, c, gamma, lam: _backwards(_right)(r, v, (c > 0.5).to(r.dtype), gamma, lam)),
-            "continues may be a probability: multiply by it, do not round it.",
-        ),
-        Misconception(
-            "gamma-missing",
-            _dreamer(_backwards(lambda r, v, c, f, gamma, lam: _right(r, v, c, f, 1.0, lam))),
-            "What follows is not discounted: multiply it by gamma.",
-        ),
-        Misconception(
-            "gamma-on-the-return-only",
-            _dreamer(_backwards(lambda r, v, c, f, gamma, lam: r + c * ((1 - lam) * v + gamma * lam * f))),
-            "gamma multiplies both: the value is one step away, too.",
-        ),
-        Misconception(
-            "weights-do-not-sum-to-one",
-            _dreamer(_backwards(lambda r, v, c, f, gamma, lam: r + gamma * c * (v + lam * f))),
-            "The value has the weight 1 - λ: with 1 what follows is counted 1 + λ times.",
-        ),
-        Misconception(
-            "lam-missing",
-            _dreamer(_backwards(lambda r, v, c, f, gamma, lam: _right(r, v, c, f, gamma, 1.0))),
-            "lam is not used: these are the sums of all rewards.",
-        ),
-        Misconception(
-            "one-step-only",
-            _dreamer(lambda r, v, c, gamma, lam: r + gamma * c * v),
-            "lam is not used: these are one-step targets.",
-        ),
-        Misconception(
-            "advantages",
-            _dreamer(lambda r, v, c, gamma, lam: _backwards(_right)(r, v, c, gamma, lam) - v),
-            "values are subtracted: the returns themselves are asked for.",
-        ),
-        Misconception(
-            "forwards",
-            _dreamer(_forwards),
-            "Time runs the wrong way: a return depends on what comes after, so begin with the last step.",
-        ),
-        Misconception(
-            "order-reversed",
-            _dreamer(lambda r, v, c, gamma, lam: _backwards(_right)(r, v, c, gamma, lam).flip(0)),
-            "The returns come in the order in which they were computed, last step first: turn them round.",
-        ),
-        Misconception(
-            "values-detached",
-            _dreamer(lambda r, v, c, gamma, lam: _backwards(_right)(r, v.detach(), c, gamma, lam)),
-            "No gradient reaches values: Dreamer's policy learns through them what lies behind the horizon.",
-        ),
-        Misconception("cut-from-graph", after(ch51.dreamer_lambda_returns, torch.Tensor.detach), CUT),
+        *wrong(_WRONG_DREAMER_LAMBDA_RETURNS, _dreamer),
+        cut_from_graph(ch51.dreamer_lambda_returns),
         dtype_lost(ch51.dreamer_lambda_returns),
         in_place(ch51.dreamer_lambda_returns, "values", 1),
-        Misconception("bad-input-accepted", _dreamer(_backwards(_right), checked=False), SHAPES),
+        bad_input_accepted(_dreamer(_backwards(_right), checked=False)),
     ),
     variants={
         "sum of n-step returns": _dreamer(_as_sum),
@@ -735,6 +653,8 @@ DREAMER_LAMBDA_RETURNS = Exercise(
 )
 
 # ---------------------------------------------------------------------------------------------------- model_error_by_horizon
+
+_STEPS = ("obs", "actions")
 
 
 def _trajectories(steps=5, batch=6, obs_dim=3, action_dim=2, noise=0.0, limit=math.inf):
@@ -762,19 +682,23 @@ def _perfect(generator):
     return drawn | {"obs": torch.stack(obs)}
 
 
+_forecast = versions_of(
+    ch51.model_error_by_horizon,
+    satisfies(lambda obs, actions: len(obs) == len(actions) + 1 and obs.shape[1] == actions.shape[1]),
+)
+
+
 def _error(measure, predict=lambda model, predicted, real, taken, generator: model(predicted, taken, generator)[0], checked=True):
     """A version: `measure` takes predictions and truth, (H, B, O) each."""
 
     def version(model, obs, actions, generator):
-        if checked and (obs.shape[0] - 1, obs.shape[1]) != (actions.shape[0], actions.shape[1]):
-            raise ValueError(f"obs is (H + 1, B, O) and actions (H, B, A): {tuple(obs.shape)} and {tuple(actions.shape)}")
         latest, predictions = obs[0], []
         for t in range(len(actions)):
             latest = predict(model, latest, obs[t], actions[t], generator)
             predictions.append(latest)
         return measure(torch.stack(predictions), obs[1 : len(actions) + 1])
 
-    return version
+    return _forecast(version, checked)
 
 
 def _root_mean_square(predictions, real):
@@ -792,8 +716,6 @@ def _numpy_errors(predictions, real):
 
 def _other_order(model, obs, actions, generator):
     """Predictions first, into one tensor, then all errors."""
-    if len(obs) - len(actions) != 1 or obs.shape[1] != actions.shape[1]:
-        raise ValueError(f"{len(obs)} obs for {len(actions)} actions")
     predictions = [obs[0]]
     with torch.no_grad():
         for taken in actions.unbind(0):
@@ -801,6 +723,59 @@ def _other_order(model, obs, actions, generator):
     gaps = torch.stack(predictions)[1:] - obs[1:]
     return (gaps**2).flatten(1).sum(1).div(gaps[0].numel()).pow(0.5)
 
+
+_WRONG_MODEL_ERROR_BY_HORIZON = {
+    "one-step-predictions": (
+        _error(_root_mean_square, lambda model, predicted, real, taken, generator: model(real, taken, generator)[0]),
+        "Each prediction starts from the real observation, so errors never add up: go on from what the model predicted.",
+    ),
+    "mean-square": (
+        _error(lambda p, real: (p - real).square().mean((1, 2))),
+        "This is the mean square error: take its root, which is in units of the observations.",
+    ),
+    "mean-of-distances": (
+        _error(lambda p, real: (p - real).square().sum(-1).sqrt().mean(1)),
+        "This is the mean Euclidean distance: the mean over samples and components comes before the root.",
+    ),
+    "mean-of-roots": (
+        _error(lambda p, real: (p - real).square().mean(-1).sqrt().mean(1)),
+        "The root is taken for each sample: the mean over samples and components comes before the root.",
+    ),
+    "absolute-error": (
+        _error(lambda p, real: (p - real).abs().mean((1, 2))),
+        "This is the mean absolute error: the root mean square is asked for.",
+    ),
+    "summed-over-components": (
+        _error(lambda p, real: (p - real).square().sum(-1).mean(1).sqrt()),
+        "The squares are summed over the components: take their mean.",
+    ),
+    "error-of-the-mean": (
+        _error(lambda p, real: (p - real).mean(1).square().mean(-1).sqrt()),
+        "Errors of opposite sign cancel: square before averaging over samples.",
+    ),
+    "per-component": (
+        _error(lambda p, real: (p - real).square().mean(1).sqrt()),
+        "One number for each horizon is asked for: take the mean over components, too.",
+    ),
+    "accumulated": (
+        _error(lambda p, real: _root_mean_square(p, real).cumsum(0)),
+        "The errors of all horizons so far are added up: each horizon has its own.",
+    ),
+    "averaged-over-horizons": (
+        _error(lambda p, real: _root_mean_square(p, real).mean()),
+        "One number for each horizon is asked for: how the error grows is the point.",
+    ),
+    "start-included": (
+        _error(lambda p, real: torch.cat([torch.zeros_like(p[:1, 0, 0]), _root_mean_square(p, real)])),
+        "The horizon begins at 1: the error at the start, 0, is left out.",
+    ),
+    "first-action-repeated": (
+        lambda model, obs, actions, generator: ch51.model_error_by_horizon(
+            model, obs, actions[:1].expand_as(actions) if len(obs) == len(actions) + 1 else actions, generator
+        ),
+        "The first action is used at every step: step h takes actions[h].",
+    ),
+}
 
 MODEL_ERROR_BY_HORIZON = Exercise(
     name="model_error_by_horizon",
@@ -822,90 +797,18 @@ MODEL_ERROR_BY_HORIZON = Exercise(
         Case("calls of the model", _trajectories(), returns=("model",)),
         Case("a model that believes in ends", _trajectories(limit=0.5)),
         Case("single precision", _trajectories(), dtype=torch.float32, visible=True),
-        Case(
-            "as many obs as actions",
-            reshaped(_trajectories(), "obs", lambda x: x[:-1]),
-            raises=("obs", "actions"),
-            visible=True,
-        ),
-        Case("obs of one trajectory", reshaped(_trajectories(), "obs", lambda x: x[:, :1]), raises=("obs", "actions")),
-        Case(
-            "obs a step too long", reshaped(_trajectories(), "obs", lambda x: torch.cat([x, x[-1:]])), raises=("obs", "actions")
-        ),
+        Case("as many obs as actions", reshaped(_trajectories(), "obs", lambda x: x[:-1]), raises=_STEPS, visible=True),
+        Case("obs of one trajectory", reshaped(_trajectories(), "obs", lambda x: x[:, :1]), raises=_STEPS),
+        Case("obs a step too long", reshaped(_trajectories(), "obs", lambda x: torch.cat([x, x[-1:]])), raises=_STEPS),
     ),
     misconceptions=(
-        Misconception(
-            "one-step-predictions",
-            _error(_root_mean_square, lambda model, predicted, real, taken, generator: model(real, taken, generator)[0]),
-            "Each prediction starts from the real observation, so errors never add up: go on from what the model predicted.",
-        ),
-        Misconception(
-            "mean-square",
-            _error(lambda p, real: (p - real).square().mean((1, 2))),
-            "This is the mean square error: take its root, which is in units of the observations.",
-        ),
-        Misconception(
-            "mean-of-distances",
-            _error(lambda p, real: (p - real).square().sum(-1).sqrt().mean(1)),
-            "This is the mean Euclidean distance: the mean over samples and components comes before the root.",
-        ),
-        Misconception(
-            "mean-of-roots",
-            _error(lambda p, real: (p - real).square().mean(-1).sqrt().mean(1)),
-            "The root is taken for each sample: the mean over samples and components comes before the root.",
-        ),
-        Misconception(
-            "absolute-error",
-            _error(lambda p, real: (p - real).abs().mean((1, 2))),
-            "This is the mean absolute error: the root mean square is asked for.",
-        ),
-        Misconception(
-            "summed-over-components",
-            _error(lambda p, real: (p - real).square().sum(-1).mean(1).sqrt()),
-            "The squares are summed over the components: take their mean.",
-        ),
-        Misconception(
-            "error-of-the-mean",
-            _error(lambda p, real: (p - real).mean(1).square().mean(-1).sqrt()),
-            "Errors of opposite sign cancel: square before averaging over samples.",
-        ),
-        Misconception(
-            "per-component",
-            _error(lambda p, real: (p - real).square().mean(1).sqrt()),
-            "One number for each horizon is asked for: take the mean over components, too.",
-        ),
-        Misconception(
-            "accumulated",
-            _error(lambda p, real: _root_mean_square(p, real).cumsum(0)),
-            "The errors of all horizons so far are added up: each horizon has its own.",
-        ),
-        Misconception(
-            "averaged-over-horizons",
-            _error(lambda p, real: _root_mean_square(p, real).mean()),
-            "One number for each horizon is asked for: how the error grows is the point.",
-        ),
-        Misconception(
-            "start-included",
-            _error(lambda p, real: torch.cat([torch.zeros_like(p[:1, 0, 0]), _root_mean_square(p, real)])),
-            "The horizon begins at 1: the error at the start, 0, is left out.",
-        ),
-        Misconception(
-            "first-action-repeated",
-            lambda model, obs, actions, generator: ch51.model_error_by_horizon(
-                model, obs, actions[:1].expand_as(actions) if len(obs) == len(actions) + 1 else actions, generator
-            ),
-            "The first action is used at every step: step h takes actions[h].",
-        ),
-        Misconception(
-            "dtype-lost",
-            after(ch51.model_error_by_horizon, torch.Tensor.float),
-            "The result has lost the dtype of obs.",
-        ),
+        *wrong(_WRONG_MODEL_ERROR_BY_HORIZON),
+        dtype_lost(ch51.model_error_by_horizon),
         in_place(ch51.model_error_by_horizon, "obs", 1),
-        Misconception("bad-input-accepted", _error(_root_mean_square, checked=False), SHAPES),
+        bad_input_accepted(_error(_root_mean_square, checked=False)),
     ),
     variants={
-        "all predictions first": _other_order,
+        "all predictions first": _forecast(_other_order),
         "by indices": _error(_root_mean_square),
         "NumPy": _error(_numpy_errors),
         "vector norm": _error(
@@ -918,8 +821,6 @@ MODEL_ERROR_BY_HORIZON = Exercise(
 )
 
 # -------------------------------------------------------------------------------------------------------- repaired_next_obs
-
-_LAB = ("obs", "actions")
 
 
 def _planned(batch=5, seen=40, obs_dim=3, action_dim=2, spread=1.0):
@@ -943,6 +844,9 @@ def _moments(x, deviation=lambda x: x.std(0)):
     return x.mean(0), deviation(x)
 
 
+_next_obs = versions_of(ch51.repaired_next_obs, satisfies(lambda obs, actions: len(obs) == len(actions)))
+
+
 def _predicted(
     of_inputs=lambda inputs, seen: _moments(seen),
     of_changes=lambda seen: _moments(seen["next_obs"] - seen["obs"]),
@@ -952,13 +856,11 @@ def _predicted(
     """A version of the repair: which moments scale the inputs, which the changes, and what is made of them."""
 
     def version(network, obs, actions, seen):
-        if checked and obs.shape[0] != actions.shape[0]:
-            raise ValueError(f"obs {tuple(obs.shape)} and actions {tuple(actions.shape)} are not of the same steps")
         inputs = torch.cat([obs, actions], 1)
         level, scale = of_inputs(inputs, torch.cat([seen["obs"], seen["actions"]], 1))
         return finish(obs, network((inputs - level) / scale), *of_changes(seen))
 
-    return version
+    return _next_obs(version, checked)
 
 
 def _biased(x):
@@ -972,8 +874,6 @@ def _observations_only(inputs, seen):
 
 
 def _row_at_a_time(network, obs, actions, seen):
-    if obs.shape[0] != actions.shape[0]:
-        raise ValueError(f"as many actions as obs are needed: {actions.shape[0]} and {obs.shape[0]}")
     inputs = np.concatenate([seen["obs"].numpy(), seen["actions"].numpy()], 1)
     changes = seen["next_obs"].numpy() - seen["obs"].numpy()
     rows = []
@@ -986,13 +886,70 @@ def _row_at_a_time(network, obs, actions, seen):
 
 def _among_the_seen(network, obs, actions, seen):
     """Scale everything in one go."""
-    if len(obs) != len(actions):
-        raise ValueError(f"obs has {len(obs)} rows and actions {len(actions)}")
     inputs, known = torch.cat([obs, actions], 1), torch.cat([seen["obs"], seen["actions"]], 1)
     variance, level = torch.var_mean(known, 0)
     spread, drift = torch.std_mean(seen["next_obs"] - seen["obs"], 0)
     return torch.addcmul(obs + drift, spread, network((inputs - level) * variance.rsqrt()))
 
+
+_WRONG_REPAIRED_NEXT_OBS = {
+    "scaled-by-its-own-batch": (
+        _predicted(lambda inputs, seen: _moments(inputs)),
+        "This is the suspect program's own bug. What does the network see of a state whose neighbours in the batch are the same state?",
+    ),
+    "actions-scaled-by-their-own-batch": (
+        _predicted(_observations_only),
+        "The actions are still scaled by the batch that they come in: a prediction must not depend on its neighbours.",
+    ),
+    "scaled-with-the-batch": (
+        _predicted(lambda inputs, seen: _moments(torch.cat([seen, inputs]))),
+        "The batch has joined the steps that were seen: the scale must be the one that the network was trained with.",
+    ),
+    "not-scaled": (
+        _predicted(lambda inputs, seen: (0.0, 1.0)),
+        "The network was trained on inputs of mean 0 and deviation 1: here it gets them in their own units.",
+    ),
+    "not-centred": (
+        _predicted(lambda inputs, seen: (0.0, seen.std(0))),
+        "The inputs are divided by their scale, but the mean is not subtracted.",
+    ),
+    "divided-by-the-variance": (
+        _predicted(lambda inputs, seen: _moments(seen, lambda x: x.var(0))),
+        "The inputs are divided by their variance: it is the standard deviation that brings them to 1.",
+    ),
+    "one-scale-for-all-components": (
+        _predicted(lambda inputs, seen: (seen.mean(), seen.std())),
+        "One mean and one deviation for all components: each component has its own.",
+    ),
+    "change-taken-for-the-state": (
+        _predicted(finish=lambda obs, change, level, scale: level + scale * change),
+        "This is the change: add it to the observation.",
+    ),
+    "change-left-scaled": (
+        _predicted(finish=lambda obs, change, level, scale: obs + change),
+        "The network gives changes of mean 0 and deviation 1: bring them back to units of observations.",
+    ),
+    "mean-change-forgotten": (
+        _predicted(finish=lambda obs, change, level, scale: obs + scale * change),
+        "The mean change was subtracted before training: add it again.",
+    ),
+    "mean-change-scaled-too": (
+        _predicted(finish=lambda obs, change, level, scale: obs + scale * (level + change)),
+        "The mean change is in units of observations already: scale what the network gives, then add it.",
+    ),
+    "scale-of-the-next-observations": (
+        _predicted(of_changes=lambda seen: _moments(seen["next_obs"])),
+        "The outputs are scaled back by the moments of next_obs: the network learned changes, next_obs - obs.",
+    ),
+    "scale-of-the-observations": (
+        _predicted(of_changes=lambda seen: _moments(seen["obs"])),
+        "The outputs are scaled back by the moments of the observations: the network learned changes, next_obs - obs.",
+    ),
+    "change-the-wrong-way-round": (
+        _predicted(of_changes=lambda seen: _moments(seen["obs"] - seen["next_obs"])),
+        "The change is what comes after minus what was before.",
+    ),
+}
 
 REPAIRED_NEXT_OBS = Exercise(
     name="repaired_next_obs",
@@ -1006,90 +963,20 @@ REPAIRED_NEXT_OBS = Exercise(
         Case("a single state", _planned(1), visible=True),
         Case("more states than were seen", _planned(30, 12)),
         Case("single precision", _planned(), dtype=torch.float32, visible=True),
-        Case("actions of one step", reshaped(_planned(), "actions", lambda x: x[:1]), raises=_LAB, visible=True),
-        Case("obs without the last", reshaped(_planned(), "obs", lambda x: x[:-1]), raises=_LAB),
+        Case("actions of one step", reshaped(_planned(), "actions", lambda x: x[:1]), raises=_STEPS, visible=True),
+        Case("obs without the last", reshaped(_planned(), "obs", lambda x: x[:-1]), raises=_STEPS),
     ),
     misconceptions=(
-        Misconception(
-            "scaled-by-its-own-batch",
-            _predicted(lambda inputs, seen: _moments(inputs)),
-            "This is the suspect program's own bug. What does the network see of a state whose neighbours in the batch are the"
-            " same state?",
-        ),
-        Misconception(
-            "actions-scaled-by-their-own-batch",
-            _predicted(_observations_only),
-            "The actions are still scaled by the batch that they come in: a prediction must not depend on its neighbours.",
-        ),
-        Misconception(
-            "scaled-with-the-batch",
-            _predicted(lambda inputs, seen: _moments(torch.cat([seen, inputs]))),
-            "The batch has joined the steps that were seen: the scale must be the one that the network was trained with.",
-        ),
-        Misconception(
-            "not-scaled",
-            _predicted(lambda inputs, seen: (0.0, 1.0)),
-            "The network was trained on inputs of mean 0 and deviation 1: here it gets them in their own units.",
-        ),
-        Misconception(
-            "not-centred",
-            _predicted(lambda inputs, seen: (0.0, seen.std(0))),
-            "The inputs are divided by their scale, but the mean is not subtracted.",
-        ),
-        Misconception(
-            "divided-by-the-variance",
-            _predicted(lambda inputs, seen: _moments(seen, lambda x: x.var(0))),
-            "The inputs are divided by their variance: it is the standard deviation that brings them to 1.",
-        ),
-        Misconception(
-            "one-scale-for-all-components",
-            _predicted(lambda inputs, seen: (seen.mean(), seen.std())),
-            "One mean and one deviation for all components: each component has its own.",
-        ),
-        Misconception(
-            "change-taken-for-the-state",
-            _predicted(finish=lambda obs, change, level, scale: level + scale * change),
-            "This is the change: add it to the observation.",
-        ),
-        Misconception(
-            "change-left-scaled",
-            _predicted(finish=lambda obs, change, level, scale: obs + change),
-            "The network gives changes of mean 0 and deviation 1: bring them back to units of observations.",
-        ),
-        Misconception(
-            "mean-change-forgotten",
-            _predicted(finish=lambda obs, change, level, scale: obs + scale * change),
-            "The mean change was subtracted before training: add it again.",
-        ),
-        Misconception(
-            "mean-change-scaled-too",
-            _predicted(finish=lambda obs, change, level, scale: obs + scale * (level + change)),
-            "The mean change is in units of observations already: scale what the network gives, then add it.",
-        ),
-        Misconception(
-            "scale-of-the-next-observations",
-            _predicted(of_changes=lambda seen: _moments(seen["next_obs"])),
-            "The outputs are scaled back by the moments of next_obs: the network learned changes, next_obs - obs.",
-        ),
-        Misconception(
-            "scale-of-the-observations",
-            _predicted(of_changes=lambda seen: _moments(seen["obs"])),
-            "The outputs are scaled back by the moments of the observations: the network learned changes, next_obs - obs.",
-        ),
-        Misconception(
-            "change-the-wrong-way-round",
-            _predicted(of_changes=lambda seen: _moments(seen["obs"] - seen["next_obs"])),
-            "The change is what comes after minus what was before.",
-        ),
+        *wrong(_WRONG_REPAIRED_NEXT_OBS),
         dtype_lost(ch51.repaired_next_obs),
         in_place(ch51.repaired_next_obs, "obs", 1),
-        Misconception("bad-input-accepted", _predicted(checked=False), SHAPES),
+        bad_input_accepted(_predicted(checked=False)),
     ),
     variants={
         "biased deviations": _predicted(lambda inputs, seen: _biased(seen), lambda seen: _biased(seen["next_obs"] - seen["obs"])),
         "moments passed along": _predicted(),
-        "a row at a time, in NumPy": _row_at_a_time,
-        "var_mean and addcmul": _among_the_seen,
+        "a row at a time, in NumPy": _next_obs(_row_at_a_time),
+        "var_mean and addcmul": _next_obs(_among_the_seen),
     },
 )
 
