@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -85,6 +86,16 @@ def drawn_once(*cases: Case) -> tuple[Case, ...]:
 def after(function: Callable, change: Callable) -> Callable:
     """Right, and then spoilt."""
     return lambda *args, **kwargs: change(function(*args, **kwargs))
+
+
+def drawing(draw: Callable[..., dict[str, Any]]) -> Callable[..., Inputs]:
+    """Makes inputs with settings of a function that draws them: `@drawing` on `def steps(generator, size=8)`, then `steps(size=5)`."""
+
+    @functools.wraps(draw)
+    def settled(*settings, **named) -> Inputs:
+        return lambda generator: draw(generator, *settings, **named)
+
+    return settled
 
 
 def versions_of(reference: Callable, *checks: Check, data: Sequence[str] = ()) -> Callable:

@@ -15,6 +15,7 @@ from autograder.authoring.parts import (
     after,
     bad_input_accepted,
     cut_from_graph,
+    drawing,
     drawn_once,
     dtype_lost,
     in_place,
@@ -43,30 +44,24 @@ HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 _SQUASHED = ("mean", "log_std", "pre_tanh_actions")
 
 
-def _squashed(size=7, dims=3, reach=1.0, base=-0.5):
+@drawing
+def _squashed(generator, size=7, dims=3, reach=1.0, base=-0.5):
     """Pre-activations at `reach` standard deviations from the mean or so."""
-
-    def inputs(generator):
-        mean, log_std = normal(generator, size, dims), base + 0.4 * normal(generator, size, dims)
-        return {
-            "mean": mean,
-            "log_std": log_std,
-            "pre_tanh_actions": mean + reach * log_std.exp() * normal(generator, size, dims),
-        }
-
-    return inputs
+    mean, log_std = normal(generator, size, dims), base + 0.4 * normal(generator, size, dims)
+    return {
+        "mean": mean,
+        "log_std": log_std,
+        "pre_tanh_actions": mean + reach * log_std.exp() * normal(generator, size, dims),
+    }
 
 
-def _saturated(size=6, dims=2, low=12.0, high=60.0):
+@drawing
+def _saturated(generator, size=6, dims=2, low=12.0, high=60.0):
     """Pre-activations whose hyperbolic tangent is ±1 to the computer, of policies that are sure of them."""
-
-    def inputs(generator):
-        signs = torch.where(uniform(generator, size, dims) < 0.5, -1.0, 1.0).double()
-        mean = signs * (low + (high - low) * uniform(generator, size, dims))
-        log_std = -0.5 + 0.3 * normal(generator, size, dims)
-        return {"mean": mean, "log_std": log_std, "pre_tanh_actions": mean + log_std.exp() * normal(generator, size, dims)}
-
-    return inputs
+    signs = torch.where(uniform(generator, size, dims) < 0.5, -1.0, 1.0).double()
+    mean = signs * (low + (high - low) * uniform(generator, size, dims))
+    log_std = -0.5 + 0.3 * normal(generator, size, dims)
+    return {"mean": mean, "log_std": log_std, "pre_tanh_actions": mean + log_std.exp() * normal(generator, size, dims)}
 
 
 def _at_rest(generator):
@@ -225,28 +220,24 @@ _TARGET = ("rewards", "next_q1", "next_q2", "next_log_probs")
 _TARGET_SHAPES = ("rewards", "terminated", "next_q1", "next_q2", "next_log_probs")
 
 
-def _steps(size=8, alpha=0.3, gamma=0.97, ends=None, **fixed):
+@drawing
+def _steps(generator, size=8, alpha=0.3, gamma=0.97, ends=None, **fixed):
     """Steps of which about every third terminates, unless all or none do."""
-
-    def inputs(generator):
-        first = 20 + 5 * normal(generator, size)
-        terminated = uniform(generator, size) < 0.35
-        terminated[0], terminated[-1] = True, False
-        return {
-            "rewards": normal(generator, size),
-            "terminated": terminated if ends is None else torch.full_like(terminated, ends),
-            "next_q1": first,
-            "next_q2": first + 2 * normal(generator, size),
-            "next_log_probs": 1.5 + 3 * normal(generator, size),
-            "alpha": alpha,
-            "gamma": gamma,
-        } | fixed
-
-    return inputs
+    first = 20 + 5 * normal(generator, size)
+    terminated = uniform(generator, size) < 0.35
+    terminated[0], terminated[-1] = True, False
+    return {
+        "rewards": normal(generator, size),
+        "terminated": terminated if ends is None else torch.full_like(terminated, ends),
+        "next_q1": first,
+        "next_q2": first + 2 * normal(generator, size),
+        "next_log_probs": 1.5 + 3 * normal(generator, size),
+        "alpha": alpha,
+        "gamma": gamma,
+    } | fixed
 
 
-def _alpha_tensor(generator):
-    return _steps()(generator) | {"alpha": torch.tensor(0.7, dtype=torch.float64)}
+_ALPHA_TENSOR = replaced(_steps(), alpha=torch.tensor(0.7, dtype=torch.float64))
 
 
 def _target_by_steps(rewards, terminated, next_q1, next_q2, next_log_probs, alpha, gamma=0.99):
@@ -355,8 +346,8 @@ SOFT_Q_TARGET = Exercise(
         Case("no step terminates", _steps(ends=False), closed_form=_target_by_steps),
         Case("alpha = 0: a plain target", _steps(alpha=0.0), closed_form=_target_by_steps, visible=True),
         Case("gamma = 1", _steps(gamma=1.0), closed_form=_target_by_steps),
-        Case("alpha is a tensor", _alpha_tensor, closed_form=_target_by_steps, visible=True),
-        Case("all inputs require gradient", _alpha_tensor, differentiate=(*_TARGET, "alpha"), visible=True, draws=2),
+        Case("alpha is a tensor", _ALPHA_TENSOR, closed_form=_target_by_steps, visible=True),
+        Case("all inputs require gradient", _ALPHA_TENSOR, differentiate=(*_TARGET, "alpha"), visible=True, draws=2),
         Case("single precision", _steps(), dtype=torch.float32, visible=True),
         *shape_cases(_steps(), _TARGET_SHAPES),
         refused(_steps(), gamma=1.2, visible=True),
@@ -394,21 +385,18 @@ SOFT_Q_TARGET = Exercise(
 _ACTOR = ("q1", "q2", "log_probs")
 
 
-def _judged(size=9, alpha=0.25):
-    def inputs(generator):
-        first = 3 + 4 * normal(generator, size)
-        return {
-            "q1": first,
-            "q2": first + 2 * normal(generator, size),
-            "log_probs": 1.0 + 2 * normal(generator, size),
-            "alpha": alpha,
-        }
-
-    return inputs
+@drawing
+def _judged(generator, size=9, alpha=0.25):
+    first = 3 + 4 * normal(generator, size)
+    return {
+        "q1": first,
+        "q2": first + 2 * normal(generator, size),
+        "log_probs": 1.0 + 2 * normal(generator, size),
+        "alpha": alpha,
+    }
 
 
-def _judged_alpha_tensor(generator):
-    return _judged()(generator) | {"alpha": torch.tensor(0.6, dtype=torch.float64)}
+_JUDGED_ALPHA_TENSOR = replaced(_judged(), alpha=torch.tensor(0.6, dtype=torch.float64))
 
 
 def _actor_by_samples(q1, q2, log_probs, alpha):
@@ -490,8 +478,8 @@ SAC_ACTOR_LOSS = Exercise(
         ),
         Case("a single sample", _judged(1), closed_form=_actor_by_samples, visible=True),
         Case("a high price of entropy", _judged(alpha=4.0), closed_form=_actor_by_samples),
-        Case("alpha is a tensor", _judged_alpha_tensor, closed_form=_actor_by_samples, visible=True),
-        Case("all inputs require gradient", _judged_alpha_tensor, differentiate=(*_ACTOR, "alpha"), visible=True, draws=2),
+        Case("alpha is a tensor", _JUDGED_ALPHA_TENSOR, closed_form=_actor_by_samples, visible=True),
+        Case("all inputs require gradient", _JUDGED_ALPHA_TENSOR, differentiate=(*_ACTOR, "alpha"), visible=True, draws=2),
         Case("single precision", _judged(), dtype=torch.float32, visible=True),
         *shape_cases(_judged(), _ACTOR),
     ),
@@ -520,15 +508,13 @@ SAC_ACTOR_LOSS = Exercise(
 # -------------------------------------------------------------------------------------------------------- temperature_loss
 
 
-def _temperature(size=9, log_alpha=-1.2, target_entropy=-3.0):
-    def inputs(generator):
-        return {
-            "log_alpha": log_alpha + 0.3 * normal(generator),
-            "log_probs": 1.5 + 2 * normal(generator, size),
-            "target_entropy": target_entropy,
-        }
-
-    return inputs
+@drawing
+def _temperature(generator, size=9, log_alpha=-1.2, target_entropy=-3.0):
+    return {
+        "log_alpha": log_alpha + 0.3 * normal(generator),
+        "log_probs": 1.5 + 2 * normal(generator, size),
+        "target_entropy": target_entropy,
+    }
 
 
 def _on_target(generator):
@@ -621,33 +607,21 @@ TEMPERATURE_LOSS = Exercise(
 _PAIR = ("target_params", "online_params")
 
 
-def _networks(tau=0.1, shapes=((3, 4), (4,), ()), parameters=(), once=()):
+@drawing
+def _networks(generator, tau=0.1, shapes=((3, 4), (4,), ()), parameters=(), once=()):
     """Parameters of two networks; those named in `parameters` require gradient, those in `once` can be gone through once."""
-
-    def inputs(generator):
-        drawn = {name: [normal(generator, *shape) for shape in shapes] for name in _PAIR}
-        made = {
-            name: built("control.networks.parameters", tensors=drawn[name]) if name in parameters else drawn[name]
-            for name in _PAIR
-        }
-        made |= {name: built("control.networks.one_pass", tensors=drawn[name]) for name in once}
-        return made | {"tau": tau}
-
-    return inputs
+    drawn = {name: [normal(generator, *shape) for shape in shapes] for name in _PAIR}
+    made = {
+        name: built("control.networks.parameters", tensors=drawn[name]) if name in parameters else drawn[name] for name in _PAIR
+    }
+    made |= {name: built("control.networks.one_pass", tensors=drawn[name]) for name in once}
+    return made | {"tau": tau}
 
 
-def _mismatch(change):
-    def inputs(generator):
-        drawn = _networks()(generator)
-        return drawn | {"online_params": [change(drawn["online_params"][0]), *drawn["online_params"][1:]]}
-
-    return inputs
-
-
-def _averaged(target_params, online_params, tau):
-    """What the targets should hold afterwards, as numbers."""
-    pairs = zip(target_params, online_params, strict=True)
-    return tuple(torch.from_numpy(np.asarray((1 - tau) * old.numpy() + tau * new.numpy())) for old, new in pairs)
+@drawing
+def _mismatch(generator, change):
+    drawn = _networks()(generator)
+    return drawn | {"online_params": [change(drawn["online_params"][0]), *drawn["online_params"][1:]]}
 
 
 def _polyak(step, checked=True, graph=False):
@@ -787,23 +761,18 @@ POLYAK_UPDATE = Exercise(
 # ------------------------------------------------------------------------------------------------------ interquartile_mean
 
 
-def _scores(*shape, outlier=0.0):
-    def inputs(generator):
-        scores = 100 + 30 * normal(generator, *shape)
-        scores.view(-1)[int(uniform(generator, 1) * scores.numel())] += outlier
-        return {"scores": scores}
-
-    return inputs
+@drawing
+def _scores(generator, *shape, outlier=0.0):
+    scores = 100 + 30 * normal(generator, *shape)
+    scores.view(-1)[int(uniform(generator, 1) * scores.numel())] += outlier
+    return {"scores": scores}
 
 
-def _tasks_apart(seeds=5, tasks=3):
+@drawing
+def _tasks_apart(generator, seeds=5, tasks=3):
     """Tasks on different levels: the middle half of all is not the mean of middle halves."""
-
-    def inputs(generator):
-        levels = torch.tensor([0.0, 40.0, 400.0], dtype=torch.float64)[:tasks]
-        return {"scores": levels + 10 * normal(generator, seeds, tasks)}
-
-    return inputs
+    levels = torch.tensor([0.0, 40.0, 400.0], dtype=torch.float64)[:tasks]
+    return {"scores": levels + 10 * normal(generator, seeds, tasks)}
 
 
 def _four_of_each(scores):
@@ -959,23 +928,20 @@ LUCKY = (0, 0, 0, 1)
 _SPARE: dict[str, Any] = {"rtol": 1e-4, "atol": 1e-4}
 
 
-def _pattern(*columns, confidence=0.5, num_resamples=400):
+@drawing
+def _pattern(generator, *columns, confidence=0.5, num_resamples=400):
     """Few distinct scores, in random order and units. Their resampled means are few, too, and the ends of the interval fall on
     them: then every right bootstrap gives the same numbers but for one draw in millions."""
-
-    def inputs(generator):
-        rows = torch.tensor(columns, dtype=torch.float64).T
-        rows = torch.stack([column[torch.randperm(len(column), generator=generator)] for column in rows.T], 1)
-        scale, shift = 1 + 9 * uniform(generator, 1), 100 * normal(generator, 1)
-        scores = shift + scale * rows
-        return {
-            "scores": scores[:, 0] if len(columns) == 1 else scores,
-            "confidence": confidence,
-            "num_resamples": num_resamples,
-            "generator": built("seeding.generator", seed=int(1e6 * uniform(generator, 1))),
-        }
-
-    return inputs
+    rows = torch.tensor(columns, dtype=torch.float64).T
+    rows = torch.stack([column[torch.randperm(len(column), generator=generator)] for column in rows.T], 1)
+    scale, shift = 1 + 9 * uniform(generator, 1), 100 * normal(generator, 1)
+    scores = shift + scale * rows
+    return {
+        "scores": scores[:, 0] if len(columns) == 1 else scores,
+        "confidence": confidence,
+        "num_resamples": num_resamples,
+        "generator": built("seeding.generator", seed=int(1e6 * uniform(generator, 1))),
+    }
 
 
 def _together(generator):
@@ -983,11 +949,6 @@ def _together(generator):
     drawn = _pattern(FEW)(generator)
     first = drawn["scores"]
     return drawn | {"scores": torch.stack([first, first.max() + first.min() - first], 1)}
-
-
-def _levels(generator):
-    """Tasks of different levels in which all seeds agree: nothing is uncertain."""
-    return _pattern((0,) * 6, (1,) * 6, (5,) * 6)(generator)
 
 
 def _certain(scores, **_rest):
@@ -1178,7 +1139,13 @@ BOOTSTRAP_INTERVAL = Exercise(
         Case("confidence 0.9", _pattern(HALVES, confidence=0.9, num_resamples=1000), **_SPARE),
         Case("two tasks", _pattern(FEW, [score + 10 for score in FEW], confidence=0.7), visible=True, **_SPARE),
         Case("two tasks in which seeds trade places", _together, visible=True, draws=2, **_SPARE),
-        Case("three tasks, all seeds alike: no width", _levels, closed_form=_certain, visible=True, **_SPARE),
+        Case(
+            "three tasks, all seeds alike: no width",
+            _pattern((0,) * 6, (1,) * 6, (5,) * 6),
+            closed_form=_certain,
+            visible=True,
+            **_SPARE,
+        ),
         Case("a single seed: no width", _pattern((3,)), closed_form=_certain, **_SPARE),
         Case("default settings", without(_pattern(HALVES), "confidence", "num_resamples"), visible=True, **_SPARE),
         Case("no generator", replaced(_pattern(HALVES), generator=None), **_SPARE),
@@ -1204,25 +1171,22 @@ BOOTSTRAP_INTERVAL = Exercise(
 _ROWS = ("sent", "rewards", "truncated")
 
 
-def _motor_steps(size=6, dims=2, low=(-1.0, 0.5), high=(3.0, 1.5), reach=1.0):
+@drawing
+def _motor_steps(generator, size=6, dims=2, low=(-1.0, 0.5), high=(3.0, 1.5), reach=1.0):
     """Steps of motors whose commands lie within `reach` of their range around its middle."""
-
-    def inputs(generator):
-        lower, upper = torch.tensor(low, dtype=torch.float64), torch.tensor(high, dtype=torch.float64)
-        ends = uniform(generator, 2, size) < 0.5
-        ends[:, 0], ends[:, -1] = torch.tensor([True, False]), torch.tensor([False, True])
-        return {
-            "obs": normal(generator, size, 3),
-            "sent": 0.5 * (lower + upper) + reach * (uniform(generator, size, dims) - 0.5) * (upper - lower),
-            "rewards": normal(generator, size),
-            "next_obs": normal(generator, size, 3),
-            "terminated": ends[0],
-            "truncated": ends[1],
-            "low": lower,
-            "high": upper,
-        }
-
-    return inputs
+    lower, upper = torch.tensor(low, dtype=torch.float64), torch.tensor(high, dtype=torch.float64)
+    ends = uniform(generator, 2, size) < 0.5
+    ends[:, 0], ends[:, -1] = torch.tensor([True, False]), torch.tensor([False, True])
+    return {
+        "obs": normal(generator, size, 3),
+        "sent": 0.5 * (lower + upper) + reach * (uniform(generator, size, dims) - 0.5) * (upper - lower),
+        "rewards": normal(generator, size),
+        "next_obs": normal(generator, size, 3),
+        "terminated": ends[0],
+        "truncated": ends[1],
+        "low": lower,
+        "high": upper,
+    }
 
 
 _rewritten = versions_of(

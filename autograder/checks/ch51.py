@@ -13,6 +13,7 @@ from autograder.authoring.parts import (
     after,
     bad_input_accepted,
     cut_from_graph,
+    drawing,
     drawn_once,
     dtype_lost,
     in_place,
@@ -39,16 +40,14 @@ LOG_TWO_PI = math.log(2 * math.pi)
 _PREDICTED = ("mean", "log_var", "targets")
 
 
-def _ensemble(members=3, batch=5, dims=4, own_samples=False):
-    def inputs(generator):
-        shape = members, batch, dims
-        return {
-            "mean": normal(generator, *shape),
-            "log_var": -0.7 + 0.8 * normal(generator, *shape),
-            "targets": normal(generator, *(shape if own_samples else shape[1:])),
-        }
-
-    return inputs
+@drawing
+def _ensemble(generator, members=3, batch=5, dims=4, own_samples=False):
+    shape = members, batch, dims
+    return {
+        "mean": normal(generator, *shape),
+        "log_var": -0.7 + 0.8 * normal(generator, *shape),
+        "targets": normal(generator, *(shape if own_samples else shape[1:])),
+    }
 
 
 def _extremes(generator):
@@ -223,18 +222,16 @@ def _world(generator, obs_dim, action_dim, noise, limit):
     return model, built("control.dynamics.LinearPolicy", gains=0.4 * normal(generator, obs_dim, action_dim), noise=noise)
 
 
-def _dreams(batch=6, obs_dim=3, action_dim=2, horizon=5, noise=0.0, limit=math.inf):
-    def inputs(generator):
-        model, policy = _world(generator, obs_dim, action_dim, noise, limit)
-        return {
-            "model": model,
-            "policy": policy,
-            "start_obs": 0.5 * normal(generator, batch, obs_dim),
-            "horizon": horizon,
-            "generator": built("seeding.generator", seed=int(1e6 * uniform(generator, 1))),
-        }
-
-    return inputs
+@drawing
+def _dreams(generator, batch=6, obs_dim=3, action_dim=2, horizon=5, noise=0.0, limit=math.inf):
+    model, policy = _world(generator, obs_dim, action_dim, noise, limit)
+    return {
+        "model": model,
+        "policy": policy,
+        "start_obs": 0.5 * normal(generator, batch, obs_dim),
+        "horizon": horizon,
+        "generator": built("seeding.generator", seed=int(1e6 * uniform(generator, 1))),
+    }
 
 
 def _ending(generator):
@@ -293,18 +290,6 @@ def _dream(
         return finish(_stacked(obs, actions, rewards, continues))
 
     return version
-
-
-def _without_start(result):
-    return result | {"obs": result["obs"][1:]}
-
-
-def _without_end(result):
-    return result | {"obs": result["obs"][:-1]}
-
-
-def _batch_first(result):
-    return {name: column.transpose(0, 1) for name, column in result.items()}
 
 
 def _row_by_row(model, policy, start_obs, horizon, generator):
@@ -380,12 +365,18 @@ _WRONG_IMAGINE = {
         _dream(ends=lambda alive, goes_on: alive * goes_on.min()),
         "Where one trajectory ends, all do here: each has its own end.",
     ),
-    "start-left-out": (_dream(finish=_without_start), "obs begins with start_obs: it has H + 1 entries."),
+    "start-left-out": (
+        _dream(finish=lambda result: result | {"obs": result["obs"][1:]}),
+        "obs begins with start_obs: it has H + 1 entries.",
+    ),
     "last-state-left-out": (
-        _dream(finish=_without_end),
+        _dream(finish=lambda result: result | {"obs": result["obs"][:-1]}),
         "The state that the last step led to is missing: obs has H + 1 entries, and the last value is bootstrapped from it.",
     ),
-    "batch-first": (_dream(finish=_batch_first), "Time comes first: (H, B), not (B, H)."),
+    "batch-first": (
+        _dream(finish=lambda result: {name: column.transpose(0, 1) for name, column in result.items()}),
+        "Time comes first: (H, B), not (B, H).",
+    ),
     "policy-asked-twice": (
         _dream(before=lambda model, policy, obs, generator: policy(obs, generator)),
         "The policy is called more than once in a step: what is recorded must be the action that the model was given.",
@@ -437,17 +428,15 @@ IMAGINE = Exercise(
 _IMAGINED = ("rewards", "values", "continues")
 
 
-def _imagined(steps=6, batch=4, gamma=0.95, lam=0.8, ends=0.2):
-    def inputs(generator):
-        return {
-            "rewards": normal(generator, steps, batch),
-            "values": 5 + 3 * normal(generator, steps, batch),
-            "continues": (uniform(generator, steps, batch) >= ends).double(),
-            "gamma": gamma,
-            "lam": lam,
-        }
-
-    return inputs
+@drawing
+def _imagined(generator, steps=6, batch=4, gamma=0.95, lam=0.8, ends=0.2):
+    return {
+        "rewards": normal(generator, steps, batch),
+        "values": 5 + 3 * normal(generator, steps, batch),
+        "continues": (uniform(generator, steps, batch) >= ends).double(),
+        "gamma": gamma,
+        "lam": lam,
+    }
 
 
 def _fractions(generator):
@@ -470,10 +459,6 @@ def _as_sum(rewards, values, continues, gamma, lam):
             result[t] = result[t] + share * n_step
             weight *= lam
     return result
-
-
-def _monte_carlo(rewards, values, continues, gamma, **_rest):
-    return _as_sum(rewards, values, continues, gamma, 1.0)
 
 
 def _one_step(rewards, values, continues, gamma, **_rest):
@@ -623,7 +608,7 @@ DREAMER_LAMBDA_RETURNS = Exercise(
         Case("six steps", _imagined(), closed_form=_as_sum, visible=True, draws=2),
         Case("no ends", _imagined(ends=0.0), closed_form=_as_sum, visible=True),
         Case("lam = 0: one step and the next value", _imagined(lam=0.0), closed_form=_one_step, visible=True),
-        Case("lam = 1: all rewards and the last value", _imagined(lam=1.0, ends=0.0), closed_form=_monte_carlo, visible=True),
+        Case("lam = 1: all rewards and the last value", _imagined(lam=1.0, ends=0.0), closed_form=_as_sum, visible=True),
         Case("gamma = 1", _imagined(gamma=1.0), closed_form=_as_sum),
         Case("one step", _imagined(1), closed_form=_as_sum),
         Case("one step, which ends", _imagined(1, ends=1.0), closed_form=_as_sum),
@@ -657,19 +642,16 @@ DREAMER_LAMBDA_RETURNS = Exercise(
 _STEPS = ("obs", "actions")
 
 
-def _trajectories(steps=5, batch=6, obs_dim=3, action_dim=2, noise=0.0, limit=math.inf):
+@drawing
+def _trajectories(generator, steps=5, batch=6, obs_dim=3, action_dim=2, noise=0.0, limit=math.inf):
     """Real trajectories that a model does not quite know."""
-
-    def inputs(generator):
-        model, _ = _world(generator, obs_dim, action_dim, noise, limit)
-        return {
-            "model": model,
-            "obs": normal(generator, steps + 1, batch, obs_dim) * torch.linspace(0.5, 2.0, obs_dim, dtype=torch.float64),
-            "actions": normal(generator, steps, batch, action_dim),
-            "generator": built("seeding.generator", seed=int(1e6 * uniform(generator, 1))),
-        }
-
-    return inputs
+    model, _ = _world(generator, obs_dim, action_dim, noise, limit)
+    return {
+        "model": model,
+        "obs": normal(generator, steps + 1, batch, obs_dim) * torch.linspace(0.5, 2.0, obs_dim, dtype=torch.float64),
+        "actions": normal(generator, steps, batch, action_dim),
+        "generator": built("seeding.generator", seed=int(1e6 * uniform(generator, 1))),
+    }
 
 
 def _perfect(generator):
@@ -703,10 +685,6 @@ def _error(measure, predict=lambda model, predicted, real, taken, generator: mod
 
 def _root_mean_square(predictions, real):
     return (predictions - real).square().mean((1, 2)).sqrt()
-
-
-def _against_the_step_before(predictions, real):
-    return _root_mean_square(predictions[1:], real[:-1])
 
 
 def _numpy_errors(predictions, real):
@@ -823,21 +801,18 @@ MODEL_ERROR_BY_HORIZON = Exercise(
 # -------------------------------------------------------------------------------------------------------- repaired_next_obs
 
 
-def _planned(batch=5, seen=40, obs_dim=3, action_dim=2, spread=1.0):
+@drawing
+def _planned(generator, batch=5, seen=40, obs_dim=3, action_dim=2, spread=1.0):
     """States to predict from, `spread` wide, and the steps that were seen; each component has a level and a scale of its own."""
-
-    def inputs(generator):
-        level, scale = 2 * normal(generator, obs_dim), 0.5 + 2 * uniform(generator, obs_dim)
-        obs, actions = level + scale * normal(generator, seen, obs_dim), 1 + 2 * normal(generator, seen, action_dim)
-        changes = normal(generator, obs_dim) + (0.3 + uniform(generator, obs_dim)) * normal(generator, seen, obs_dim)
-        return {
-            "network": built("control.dynamics.FixedNetwork", weights=0.7 * normal(generator, obs_dim + action_dim, obs_dim)),
-            "obs": level + scale * (normal(generator, obs_dim) + spread * normal(generator, batch, obs_dim)),
-            "actions": normal(generator, batch, action_dim),
-            "seen": {"obs": obs, "actions": actions, "next_obs": obs + changes},
-        }
-
-    return inputs
+    level, scale = 2 * normal(generator, obs_dim), 0.5 + 2 * uniform(generator, obs_dim)
+    obs, actions = level + scale * normal(generator, seen, obs_dim), 1 + 2 * normal(generator, seen, action_dim)
+    changes = normal(generator, obs_dim) + (0.3 + uniform(generator, obs_dim)) * normal(generator, seen, obs_dim)
+    return {
+        "network": built("control.dynamics.FixedNetwork", weights=0.7 * normal(generator, obs_dim + action_dim, obs_dim)),
+        "obs": level + scale * (normal(generator, obs_dim) + spread * normal(generator, batch, obs_dim)),
+        "actions": normal(generator, batch, action_dim),
+        "seen": {"obs": obs, "actions": actions, "next_obs": obs + changes},
+    }
 
 
 def _moments(x, deviation=lambda x: x.std(0)):

@@ -6,17 +6,20 @@ import math
 
 import numpy as np
 import torch
+from torch.distributions import Categorical, MultivariateNormal, Normal
 from torch.nn import functional as F
 
 from autograder.authoring.parts import (
     DTYPE,
     bad_input_accepted,
+    drawing,
     dtype_lost,
     integers,
     normal,
     number,
     one_shape,
     python_float,
+    replaced,
     reshaped,
     satisfies,
     uniform,
@@ -56,18 +59,15 @@ _EPISODES = "num_episodes = 0 asks for nothing: refuse it with a ValueError that
 # ----------------------------------------------------------------------------------------------- collect_demonstrations
 
 
-def _drive(env, policy, **settings):
+@drawing
+def _drive(generator, env, policy, **settings):
     """A case with a policy on a road; `env` and `policy` make what is built from the case's generator."""
-
-    def inputs(generator):
-        return {
-            "policy": policy(generator),
-            "env": env,
-            "num_episodes": 2,
-            "seed": _integer(generator, 10_000),
-        } | settings
-
-    return inputs
+    return {
+        "policy": policy(generator),
+        "env": env,
+        "num_episodes": 2,
+        "seed": _integer(generator, 10_000),
+    } | settings
 
 
 def _driver(**settings):
@@ -307,17 +307,14 @@ def _steps(lengths, ids=None):
     return numbers.repeat_interleave(torch.as_tensor(lengths))
 
 
-def _split(episode_ids, fraction):
+@drawing
+def _split(generator, episode_ids, fraction):
     """`episode_ids` is made from the case's generator."""
-
-    def inputs(generator):
-        return {
-            "episode_ids": episode_ids(generator),
-            "fraction": fraction,
-            "generator": built("seeding.generator", seed=_integer(generator, 10_000)),
-        }
-
-    return inputs
+    return {
+        "episode_ids": episode_ids(generator),
+        "fraction": fraction,
+        "generator": built("seeding.generator", seed=_integer(generator, 10_000)),
+    }
 
 
 def _even(count, length=7):
@@ -418,10 +415,6 @@ def _indices(ids, fraction, generator):
     return (~held_out).nonzero().squeeze(1), held_out.nonzero().squeeze(1)
 
 
-def _reseeded(ids, fraction, generator):
-    return _sides(_held(ids, fraction, generator.manual_seed(0)))
-
-
 def _with_a_set(ids, fraction, generator):
     numbers = sorted(set(ids.tolist()))
     keys = torch.rand(len(numbers), generator=generator, dtype=torch.float64).tolist()
@@ -492,7 +485,7 @@ _WRONG_SPLIT_BY_EPISODE = {
         "The order comes from the global generator: pass generator=generator, so that a seed makes the split again.",
     ),
     "reseeded-inside": (
-        _reseeded,
+        lambda ids, fraction, generator: _sides(_held(ids, fraction, generator.manual_seed(0))),
         "The generator is set back at every call, so every split is the same one: use it as it comes.",
     ),
     "indices-returned": (_indices, "Bool masks over the steps are asked for, not indices."),
@@ -541,14 +534,12 @@ SPLIT_BY_EPISODE = Exercise(
 # ----------------------------------------------------------------------------------------------- behavioural_cloning_loss
 
 
-def _choices(size=24, actions=4, spread=1.5):
-    def inputs(generator):
-        return {
-            "logits": spread * normal(generator, size, actions),
-            "expert_actions": integers(generator, 0, actions, size),
-        }
-
-    return inputs
+@drawing
+def _choices(generator, size=24, actions=4, spread=1.5):
+    return {
+        "logits": spread * normal(generator, size, actions),
+        "expert_actions": integers(generator, 0, actions, size),
+    }
 
 
 def _right_by_far(generator):
@@ -660,7 +651,7 @@ BEHAVIOURAL_CLONING_LOSS = Exercise(
     variants={
         "log_softmax and gather": _discrete(lambda x, a: -_of_expert(x.log_softmax(-1), a).mean()),
         "logsumexp minus the logit": _discrete(lambda x, a: (x.logsumexp(-1) - x[torch.arange(len(a)), a]).mean()),
-        "a categorical distribution": _discrete(lambda x, a: -torch.distributions.Categorical(logits=x).log_prob(a).mean()),
+        "a categorical distribution": _discrete(lambda x, a: -Categorical(logits=x).log_prob(a).mean()),
         "nll_loss of log_softmax": _discrete(lambda x, a: F.nll_loss(F.log_softmax(x, dim=1), a)),
         "one row at a time": _discrete(
             lambda x, a: torch.stack([torch.logsumexp(row - row[i], 0) for row, i in zip(x, a, strict=True)]).mean()
@@ -676,18 +667,16 @@ _PAIR = ("mean", "expert_actions")
 _GAUSSIAN = ("mean", "log_std", "expert_actions")
 
 
-def _continuous(size=11, actions=3, per_state=False, log_std=-0.5, spread=0.8):
-    def inputs(generator):
-        mean = normal(generator, size, actions)
-        shape = (size, actions) if per_state else (actions,)
-        log_stds = log_std + 0.4 * normal(generator, *shape)
-        return {
-            "mean": mean,
-            "log_std": log_stds,
-            "expert_actions": mean + spread * log_stds.exp() * normal(generator, size, actions),
-        }
-
-    return inputs
+@drawing
+def _continuous(generator, size=11, actions=3, per_state=False, log_std=-0.5, spread=0.8):
+    mean = normal(generator, size, actions)
+    shape = (size, actions) if per_state else (actions,)
+    log_stds = log_std + 0.4 * normal(generator, *shape)
+    return {
+        "mean": mean,
+        "log_std": log_stds,
+        "expert_actions": mean + spread * log_stds.exp() * normal(generator, size, actions),
+    }
 
 
 def _perfect(generator):
@@ -716,15 +705,6 @@ def _gaussian_by_hand(mean, log_std, expert_actions):
             density = math.exp(-((action - mu) ** 2) / (2 * sigma**2)) / (sigma * math.sqrt(2 * math.pi))
             total -= math.log(density)
     return torch.tensor(total / len(mean), dtype=torch.float64)
-
-
-def _distribution(mean, log_std, actions):
-    return -torch.distributions.Normal(mean, log_std.exp()).log_prob(actions).sum(-1).mean()
-
-
-def _multivariate(mean, log_std, actions):
-    scale = torch.diag_embed(log_std.exp().expand_as(mean))
-    return -torch.distributions.MultivariateNormal(mean, scale_tril=scale).log_prob(actions).mean()
 
 
 _GAUSSIAN_SHAPES = "Shapes that differ broadcast silently, (B, 1) against (B, A) or a row against all rows: compare them first."
@@ -815,8 +795,10 @@ GAUSSIAN_CLONING_LOSS = Exercise(
         bad_input_accepted(_gaussian(lambda m, s, a: _surprise(m, s, a).sum(-1).mean(), checked=False), _GAUSSIAN_SHAPES),
     ),
     variants={
-        "a normal distribution": _gaussian(_distribution),
-        "a multivariate normal distribution": _gaussian(_multivariate),
+        "a normal distribution": _gaussian(lambda m, s, a: -Normal(m, s.exp()).log_prob(a).sum(-1).mean()),
+        "a multivariate normal distribution": _gaussian(
+            lambda m, s, a: -MultivariateNormal(m, scale_tril=s.exp().expand_as(m).diag_embed()).log_prob(a).mean()
+        ),
         "with the variance": _gaussian(
             lambda m, s, a: 0.5 * ((a - m) ** 2 * (-2 * s).exp() + 2 * s + math.log(2 * math.pi)).sum(dim=1).mean()
         ),
@@ -832,27 +814,24 @@ GAUSSIAN_CLONING_LOSS = Exercise(
 # --------------------------------------------------------------------------------------------------------------- train_bc
 
 
-def _regression(gain=1.0, rows=48, batch_size=48, num_steps=17, noise=0.3):
+@drawing
+def _regression(generator, gain=1.0, rows=48, batch_size=48, num_steps=17, noise=0.3):
     """Linear data for a linear network that begins at 0, and squared errors of `gain` times its output."""
-
-    def inputs(generator):
-        obs = math.sqrt(12) * (uniform(generator, rows, 2) - 0.5)
-        if batch_size == 1:  # each row says something about one of the two weights only
-            obs = 1.5 * obs.sign() * F.one_hot(torch.arange(rows) % 2)
-        signs = integers(generator, 0, 2, 1, 2) * 2 - 1
-        errors = noise * normal(generator, rows, 1)
-        return {
-            "network": built("control.road.LinearPolicy", weights=torch.zeros(1, 2), bias=torch.zeros(1)),
-            "loss_fn": built("control.demonstrations.SquaredError", gain=gain),
-            "obs": obs,
-            "actions": obs @ (1.5 * signs.double()).T + 0.8 + errors,
-            "num_steps": num_steps,
-            "batch_size": batch_size,
-            "learning_rate": 0.15,
-            "generator": built("seeding.generator", seed=_integer(generator, 10_000)),
-        }
-
-    return inputs
+    obs = math.sqrt(12) * (uniform(generator, rows, 2) - 0.5)
+    if batch_size == 1:  # each row says something about one of the two weights only
+        obs = 1.5 * obs.sign() * F.one_hot(torch.arange(rows) % 2)
+    signs = integers(generator, 0, 2, 1, 2) * 2 - 1
+    errors = noise * normal(generator, rows, 1)
+    return {
+        "network": built("control.road.LinearPolicy", weights=torch.zeros(1, 2), bias=torch.zeros(1)),
+        "loss_fn": built("control.demonstrations.SquaredError", gain=gain),
+        "obs": obs,
+        "actions": obs @ (1.5 * signs.double()).T + 0.8 + errors,
+        "num_steps": num_steps,
+        "batch_size": batch_size,
+        "learning_rate": 0.15,
+        "generator": built("seeding.generator", seed=_integer(generator, 10_000)),
+    }
 
 
 def _lines(generator):
@@ -861,10 +840,8 @@ def _lines(generator):
     return drawn | {name: drawn[name].float() for name in ("obs", "actions")}
 
 
-def _counted(generator):
-    """Batches that one pass over the data fills, with a loss that is their size."""
-    drawn = _regression(batch_size=8, num_steps=3)(generator)
-    return drawn | {"loss_fn": built("control.demonstrations.RowCount")}
+# batches that one pass over the data fills, with a loss that is their size
+_COUNTED = replaced(_regression(batch_size=8, num_steps=3), loss_fn=built("control.demonstrations.RowCount"))
 
 
 def _descend(network, learning_rate):
@@ -1026,7 +1003,7 @@ TRAIN_BC = Exercise(
         ),
         Case("a loss of twice the output", _regression(gain=2.0, num_steps=16), returns=_NETWORK, atol=0.6),
         Case("the losses on the way", _lines, view="training_curve", dtype=torch.float32, visible=True),
-        Case("a loss that counts the rows of its batch", _counted, dtype=torch.float32, visible=True),
+        Case("a loss that counts the rows of its batch", _COUNTED, dtype=torch.float32, visible=True),
         Case(
             "the generator is drawn from",
             _regression(batch_size=5, num_steps=2),
@@ -1141,15 +1118,12 @@ EVALUATE = Exercise(
 # ------------------------------------------------------------------------------------------------------------ state_shift
 
 
-def _clouds(sizes=(18, 13), dims=4, moved=0.7, widened=1.4):
+@drawing
+def _clouds(generator, sizes=(18, 13), dims=4, moved=0.7, widened=1.4):
     """Two samples, the agent's shifted and wider, with units that differ from dimension to dimension."""
-
-    def inputs(generator):
-        units = torch.tensor([1.0, 30.0, 0.02, 5.0], dtype=torch.float64)[:dims]
-        expert, agent = (normal(generator, size, dims) for size in sizes)
-        return {"expert_obs": units * expert + 2 * units, "agent_obs": units * (widened * agent + moved) + 2 * units}
-
-    return inputs
+    units = torch.tensor([1.0, 30.0, 0.02, 5.0], dtype=torch.float64)[:dims]
+    expert, agent = (normal(generator, size, dims) for size in sizes)
+    return {"expert_obs": units * expert + 2 * units, "agent_obs": units * (widened * agent + moved) + 2 * units}
 
 
 def _twice_the_same(generator):
@@ -1327,18 +1301,15 @@ STATE_SHIFT = Exercise(
 # ---------------------------------------------------------------------------------------------------------- repaired_pairs
 
 
-def _log(lengths=(5, 4, 6), ids=None):
+@drawing
+def _log(generator, lengths=(5, 4, 6), ids=None):
     """A suspect's log: the rows of three episodes, every number in it another one."""
-
-    def inputs(generator):
-        size = sum(lengths)
-        return {
-            "obs": normal(generator, size, 3),
-            "actions": normal(generator, size, 2),
-            "episode_ids": _steps(lengths, ids),
-        }
-
-    return inputs
+    size = sum(lengths)
+    return {
+        "obs": normal(generator, size, 3),
+        "actions": normal(generator, size, 2),
+        "episode_ids": _steps(lengths, ids),
+    }
 
 
 _COLUMNS = ("obs", "actions", "episode_ids")

@@ -14,6 +14,7 @@ from autograder.authoring.parts import (
     after,
     bad_input_accepted,
     cut_from_graph,
+    drawing,
     dtype_lost,
     in_place,
     integers,
@@ -38,16 +39,13 @@ def _lengths_to_mask(lengths, steps):
     return torch.arange(steps) < lengths[:, None]
 
 
-def _segments(batch=6, steps=9, full=False):
+@drawing
+def _segments(generator, batch=6, steps=9, full=False):
     """Segments of unequal length, padded behind with numbers that would be noticed."""
-
-    def inputs(generator):
-        lengths = integers(generator, 2, steps, batch)
-        mask = torch.ones(batch, steps, dtype=torch.bool) if full else _lengths_to_mask(lengths, steps)
-        rewards = 0.5 + normal(generator, batch, steps)
-        return {"rewards": torch.where(mask, rewards, 3 + rewards), "mask": mask}
-
-    return inputs
+    lengths = integers(generator, 2, steps, batch)
+    mask = torch.ones(batch, steps, dtype=torch.bool) if full else _lengths_to_mask(lengths, steps)
+    rewards = 0.5 + normal(generator, batch, steps)
+    return {"rewards": torch.where(mask, rewards, 3 + rewards), "mask": mask}
 
 
 def _padded_in_front(generator):
@@ -69,29 +67,21 @@ def _empty_segment(generator):
     return drawn
 
 
-def _equal_rewards(generator):
-    drawn = _segments()(generator)
-    return drawn | {"rewards": torch.full_like(drawn["rewards"], 2.0)}
+_EQUAL_REWARDS = reshaped(_segments(), "rewards", lambda rewards: torch.full_like(rewards, 2.0))
 
 
-def _returns(spread=1.5, size=33, level=0.0, first="returns_a", second="returns_b", lead=0.0):
+@drawing
+def _returns(generator, spread=1.5, size=33, level=0.0, first="returns_a", second="returns_b", lead=0.0):
     """Returns of `size` pairs around `level`, the first of each pair ahead by `lead` on average."""
-
-    def inputs(generator):
-        drawn = level + spread * normal(generator, 2, size)
-        return {first: drawn[0] + lead, second: drawn[1]}
-
-    return inputs
+    drawn = level + spread * normal(generator, 2, size)
+    return {first: drawn[0] + lead, second: drawn[1]}
 
 
-def _gaps(*gaps, first="returns_a", second="returns_b"):
+@drawing
+def _gaps(generator, *gaps, first="returns_a", second="returns_b"):
     """Pairs with exactly these gaps."""
-
-    def inputs(generator):
-        returns = integers(generator, -4, 5, len(gaps)).double()  # whole numbers: the gaps stay exact
-        return {first: returns + torch.tensor(gaps, dtype=torch.float64), second: returns}
-
-    return inputs
+    returns = integers(generator, -4, 5, len(gaps)).double()  # whole numbers: the gaps stay exact
+    return {first: returns + torch.tensor(gaps, dtype=torch.float64), second: returns}
 
 
 def _choices(**settings):
@@ -137,10 +127,6 @@ def _scattered(r, m):
     return r.new_zeros(len(r)).index_add(0, rows, r[m])
 
 
-def _discounted(r, m):
-    return (r * m * 0.99 ** torch.arange(r.shape[1], dtype=r.dtype)).sum(-1)
-
-
 def _last_kept(r, m):
     last = m.shape[1] - 1 - m.flip(1).int().argmax(1)
     return torch.where(m.any(1), r.gather(1, last[:, None])[:, 0], 0)
@@ -162,7 +148,10 @@ _WRONG_SEGMENT_RETURNS = {
         "The first mask.sum() steps are taken, wherever the kept ones are: select by the mask itself.",
     ),
     "last-reward-only": (_last_kept, "Only the last kept reward counts here: sum them all."),
-    "discounted": (_discounted, "No discount here: a segment's return is the plain sum."),
+    "discounted": (
+        lambda r, m: (r * m * 0.99 ** torch.arange(r.shape[1], dtype=r.dtype)).sum(-1),
+        "No discount here: a segment's return is the plain sum.",
+    ),
     "summed-over-segments": (
         lambda r, m: (r * m).sum(0),
         "This adds up different segments, step by step: sum over the last axis.",
@@ -568,10 +557,6 @@ def _biased(r, m, eps):
     return _scaled(r, m, r[m].mean(), r[m].std(unbiased=False), eps)
 
 
-def _all_equal_zero(rewards, mask):
-    return torch.zeros_like(rewards)
-
-
 _WRONG_STANDARDIZE_REWARDS = {
     "mask-ignored-in-statistics": (
         lambda r, m, eps: _scaled(r, m, r.mean(), r.std(), eps),
@@ -632,7 +617,12 @@ STANDARDIZE_REWARDS = Exercise(
         Case("padding in front", _padded_in_front),
         Case("steps left out in the middle", _holes, visible=True),
         Case("a segment without steps", _empty_segment, visible=True),
-        Case("all rewards equal: zero everywhere", _equal_rewards, closed_form=_all_equal_zero, visible=True),
+        Case(
+            "all rewards equal: zero everywhere",
+            _EQUAL_REWARDS,
+            closed_form=lambda rewards, mask: torch.zeros_like(rewards),
+            visible=True,
+        ),
         Case("single precision", _segments(), dtype=torch.float32, visible=True),
         Case("mask of one row", reshaped(_segments(), "mask", lambda m: m[:1]), raises=_STEPS, visible=True, draws=1),
         Case("mask with a step too few", reshaped(_segments(), "mask", lambda m: m[:, 1:]), raises=_STEPS, draws=1),
@@ -669,42 +659,34 @@ _SPREAD = 0.06
 """Six standard deviations of the difference between two frequencies of _PER_GROUP answers each."""
 
 
-def _groups(*gaps, temperature=1.0, level=0.0):
+@drawing
+def _groups(generator, *gaps, temperature=1.0, level=0.0):
     """Many pairs for each of these gaps, so that frequencies can be told apart."""
-
-    def inputs(generator):
-        returns = level + integers(generator, -4, 5, len(gaps)).double()
-        ahead = returns + torch.tensor(gaps, dtype=torch.float64)
-        seed = int(torch.randint(2**31, (), generator=generator))
-        return {
-            "true_returns_a": ahead.repeat_interleave(_PER_GROUP),
-            "true_returns_b": returns.repeat_interleave(_PER_GROUP),
-            "temperature": temperature,
-            "generator": built("seeding.generator", seed=seed),
-        }
-
-    return inputs
+    returns = level + integers(generator, -4, 5, len(gaps)).double()
+    ahead = returns + torch.tensor(gaps, dtype=torch.float64)
+    seed = int(torch.randint(2**31, (), generator=generator))
+    return {
+        "true_returns_a": ahead.repeat_interleave(_PER_GROUP),
+        "true_returns_b": returns.repeat_interleave(_PER_GROUP),
+        "temperature": temperature,
+        "generator": built("seeding.generator", seed=seed),
+    }
 
 
-def _few(**changes):
+@drawing
+def _few(generator, **changes):
     """A handful of pairs, which are enough for errors and for answers that are certain."""
-
-    def inputs(generator):
-        drawn = {name: 3 * normal(generator, 5) for name in _ANSWERS}
-        return drawn | {"temperature": 1.0, "generator": built("seeding.generator", seed=1)} | changes
-
-    return inputs
+    drawn = {name: 3 * normal(generator, 5) for name in _ANSWERS}
+    return drawn | {"temperature": 1.0, "generator": built("seeding.generator", seed=1)} | changes
 
 
-def _certain(generator):
-    """Gaps so large, for their temperature, that nobody errs."""
-    return _few(
-        true_returns_a=torch.tensor([1000.0, -1000.0, 3.0, 2.0, -60.0], dtype=torch.float64),
-        true_returns_b=torch.tensor([-1000.0, 1000.0, 2.0, 3.0, 60.0], dtype=torch.float64),
-        temperature=0.01,
-    )(generator)
-
-
+# gaps so large, for their temperature, that nobody errs, and the answers
+_CERTAIN = _few(
+    true_returns_a=torch.tensor([1000.0, -1000.0, 3.0, 2.0, -60.0], dtype=torch.float64),
+    true_returns_b=torch.tensor([-1000.0, 1000.0, 2.0, 3.0, 60.0], dtype=torch.float64),
+    temperature=0.01,
+)
+_CHOSEN = torch.tensor([True, False, True, False, False])
 _answers = versions_of(ch80.simulate_preferences, one_shape(*_ANSWERS), satisfies(lambda temperature: temperature > 0))
 
 
@@ -725,10 +707,6 @@ def _by_numpy(a, b, t, g):
     with np.errstate(over="ignore"):
         probability = 1 / (1 + np.exp((b - a).double().numpy() / t))
     return torch.from_numpy(rng.random(len(a)) < probability)
-
-
-def _five_certain(true_returns_a, true_returns_b, temperature, generator):
-    return torch.tensor([True, False, True, False, False])
 
 
 _FREQUENCIES: dict[str, Any] = {"view": "group_frequencies", "atol": _SPREAD}
@@ -791,7 +769,7 @@ SIMULATE_PREFERENCES = Exercise(
         Case("temperature 0.25", _groups(-0.25, 0.1, 0.25, temperature=0.25), **_FREQUENCIES, draws=1),
         Case("returns around 1000", _groups(-1.0, 0.0, 1.0, level=1000.0), **_FREQUENCIES, visible=True, draws=1),
         Case("asked twice", _groups(0.0, 1.0), repeat=2, **_FREQUENCIES, visible=True, draws=1),
-        Case("gaps that leave no doubt", _certain, closed_form=_five_certain, visible=True, draws=1),
+        Case("gaps that leave no doubt", _CERTAIN, closed_form=lambda **_given: _CHOSEN, visible=True, draws=1),
         Case("what is drawn from", _few(), returns=("generator",), view="drawn_from", visible=True, draws=1),
         Case("single precision", _groups(-1.0, 1.0), **_FREQUENCIES, dtype=torch.float32, draws=1),
         Case("temperature = 0", _few(temperature=0.0), raises=["temperature"], visible=True, draws=1),
@@ -829,22 +807,19 @@ SIMULATE_PREFERENCES = Exercise(
 _LAB = ("obs", "mask")
 
 
-def _clips(batch=6, steps=9, full=False, zeros=False, front=False):
+@drawing
+def _clips(generator, batch=6, steps=9, full=False, zeros=False, front=False):
     """Observations of unequal clips, padded with zeros or with noise, and a reward model that is not 0 at zero."""
-
-    def inputs(generator):
-        drawn = _segments(batch, steps, full)(generator)
-        mask = drawn["mask"].flip(1) if front else drawn["mask"]
-        obs = normal(generator, batch, steps, 3)
-        model = built(
-            "control.clips.QuadraticReward",
-            linear=normal(generator, 3),
-            quadratic=normal(generator, 3),
-            bias=1 + uniform(generator, 1),
-        )
-        return {"reward_model": model, "obs": obs * mask.unsqueeze(-1) if zeros else obs, "mask": mask}
-
-    return inputs
+    drawn = _segments(batch, steps, full)(generator)
+    mask = drawn["mask"].flip(1) if front else drawn["mask"]
+    obs = normal(generator, batch, steps, 3)
+    model = built(
+        "control.clips.QuadraticReward",
+        linear=normal(generator, 3),
+        quadratic=normal(generator, 3),
+        bias=1 + uniform(generator, 1),
+    )
+    return {"reward_model": model, "obs": obs * mask.unsqueeze(-1) if zeros else obs, "mask": mask}
 
 
 _learned = versions_of(ch80.repaired_segment_returns, satisfies(lambda obs, mask: obs.shape[:-1] == mask.shape))
