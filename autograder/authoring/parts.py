@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -16,8 +15,12 @@ Check = Callable[[Mapping[str, Any]], None]
 """Looks at the arguments of a call by name, and raises a ValueError that names those which it refuses."""
 
 SCALAR = "Return a 0-dim tensor, not a Python float: .item() cuts the graph that the optimiser needs."
-DTYPE = "The result has lost the inputs' dtype: cast masks and counts with .to(x.dtype), not with .float()."
+DTYPE = (
+    "The result has lost the inputs' dtype: make buffers with torch.zeros_like, cast masks and counts with .to(x.dtype), not with .float(),"
+    " and leave constants Python floats."
+)
 CUT = "Nothing can be learnt from this: the result carries no graph. Detach data only, never what is being learnt."
+NUMBER = "Return a 0-dim tensor, not a Python float: .item() makes a device wait; convert once, where you log."
 METRIC = "A reported number carries no graph: detach it, or it keeps the whole network's activations alive."
 SHAPES = (
     "Shapes that differ broadcast silently, (B, 1) against (B,) to all pairs (B, B), and impossible settings give nonsense. Check the"
@@ -61,6 +64,11 @@ def reshaped(inputs: Inputs, name: str, change: Callable[[torch.Tensor], torch.T
     return wrong
 
 
+def drawing(draw: Callable[..., dict[str, Any]]) -> Callable[..., Inputs]:
+    """Makes inputs with settings of a function that draws them: `@drawing` on `def steps(generator, size=8)`, then `steps(size=5)`."""
+    return lambda *settings, **named: lambda generator: draw(generator, *settings, **named)
+
+
 def shape_cases(inputs: Inputs, names: Sequence[str]) -> tuple[Case, ...]:
     """Each argument once without its first row; a single row in its place would broadcast, and so it comes once that way."""
     cases = [
@@ -86,16 +94,6 @@ def drawn_once(*cases: Case) -> tuple[Case, ...]:
 def after(function: Callable, change: Callable) -> Callable:
     """Right, and then spoilt."""
     return lambda *args, **kwargs: change(function(*args, **kwargs))
-
-
-def drawing(draw: Callable[..., dict[str, Any]]) -> Callable[..., Inputs]:
-    """Makes inputs with settings of a function that draws them: `@drawing` on `def steps(generator, size=8)`, then `steps(size=5)`."""
-
-    @functools.wraps(draw)
-    def settled(*settings, **named) -> Inputs:
-        return lambda generator: draw(generator, *settings, **named)
-
-    return settled
 
 
 def versions_of(reference: Callable, *checks: Check, data: Sequence[str] = ()) -> Callable:
@@ -164,8 +162,8 @@ def dtype_lost(function: Callable) -> Misconception:
     return Misconception("dtype-lost", after(function, torch.Tensor.float), DTYPE)
 
 
-def python_float(function: Callable) -> Misconception:
-    return Misconception("python-float", after(function, torch.Tensor.item), SCALAR)
+def python_float(function: Callable, message: str = SCALAR) -> Misconception:
+    return Misconception("python-float", after(function, torch.Tensor.item), message)
 
 
 def cut_from_graph(function: Callable) -> Misconception:

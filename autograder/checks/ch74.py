@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from autograder.authoring.parts import (
     DTYPE,
+    NUMBER,
     bad_input_accepted,
     drawing,
     dtype_lost,
@@ -1251,7 +1252,6 @@ _WRONG_STATE_SHIFT = {
         "The dimensions are compared one by one, which cannot see how they belong together: use the distance of whole states.",
     ),
     "sign-flipped": (_shift(lambda x, y: -_energy(x, y)), "The sign is flipped: the distances within are subtracted."),
-    "python-float": (_shift(lambda x, y: _energy(x, y).item()), "Return a 0-dim tensor, not a Python float."),
 }
 
 STATE_SHIFT = Exercise(
@@ -1277,6 +1277,7 @@ STATE_SHIFT = Exercise(
     ),
     misconceptions=(
         *wrong(_WRONG_STATE_SHIFT),
+        python_float(ch74.state_shift, NUMBER),
         dtype_lost(ch74.state_shift),
         bad_input_accepted(
             _shift(checked=False),

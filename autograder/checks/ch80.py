@@ -11,7 +11,7 @@ import torch.nn.functional as F
 
 from autograder.authoring.parts import (
     METRIC,
-    after,
+    NUMBER,
     bad_input_accepted,
     cut_from_graph,
     drawing,
@@ -490,9 +490,7 @@ PREFERENCE_ACCURACY = Exercise(
         *wrong(_WRONG_PREFERENCE_ACCURACY, _choice),
         dtype_lost(ch80.preference_accuracy),
         Misconception("graph-kept", _choice(lambda c, r: (c > r).to(c.dtype).mean() + 0 * (c - r).sum()), METRIC),
-        Misconception(
-            "python-float", after(ch80.preference_accuracy, torch.Tensor.item), "Return a 0-dim tensor, not a Python float."
-        ),
+        python_float(ch80.preference_accuracy, NUMBER),
         in_place(ch80.preference_accuracy, "chosen_returns"),
         bad_input_accepted(_choice(lambda c, r: (c[: len(r) if len(r) > 1 else None] > r).to(c.dtype).mean(), checked=False)),
     ),
