@@ -175,7 +175,7 @@ _LOG_RANGE = "The range applies to the ratio, not to its logarithm: the bounds a
 _CRITIC = "The policy's loss must not train the critic: detach the advantages."
 
 
-def _normalised(a):
+def normalised(a):
     return (a - a.mean()) / (a.std() + 1e-8)
 
 
@@ -194,7 +194,7 @@ def _wrong_losses(objective, reference, *checks):
             "Every action is made likelier, bad ones too: use the advantage with its sign.",
         ),
         "advantages-normalised-inside": (
-            loss(lambda r, a, *e: objective(r, _normalised(a), *e)),
+            loss(lambda r, a, *e: objective(r, normalised(a), *e)),
             "The loss takes the advantages as they come; whoever calls it decides on normalising.",
         ),
         "ratio-detached": (loss(objective, lambda new, old: _ratio(new, old).detach()), _DETACHED),
@@ -276,11 +276,11 @@ def _unclipped(inputs):
     return without(inputs, "clip_range")
 
 
-def _plain(r, a, _e=None):
+def plain(r, a, _e=None):
     return -(r * a).mean()
 
 
-def _clip(r, a, e=0.2):
+def clip(r, a, e=0.2):
     return -torch.minimum(r * a, r.clamp(1 - e, 1 + e) * a).mean()
 
 
@@ -288,7 +288,7 @@ def _minus_mean_advantage(log_probs, old_log_probs, advantages, clip_range=0.2):
     return -advantages.mean()
 
 
-def _clip_by_cases(log_probs, old_log_probs, advantages, clip_range=0.2):
+def clip_by_cases(log_probs, old_log_probs, advantages, clip_range=0.2):
     """Without min: a good action's ratio counts up to the upper bound, a bad one's down to the lower bound."""
     total = 0.0
     for new, old, advantage in zip(*(x.tolist() for x in (log_probs, old_log_probs, advantages)), strict=True):
@@ -297,18 +297,18 @@ def _clip_by_cases(log_probs, old_log_probs, advantages, clip_range=0.2):
     return torch.tensor(-total / len(advantages), dtype=torch.float64)
 
 
-_plain_by_cases = partial(_clip_by_cases, clip_range=INF)
+_plain_by_cases = partial(clip_by_cases, clip_range=INF)
 
-_WRONG_SURROGATE_LOSSES = _wrong_losses(_plain, ch43.surrogate_loss) | {
+_WRONG_SURROGATE_LOSSES = _wrong_losses(plain, ch43.surrogate_loss) | {
     "log-probability-instead-of-ratio": (
-        _plain_loss(_plain, lambda new, old: new),
+        _plain_loss(plain, lambda new, old: new),
         "This is REINFORCE's loss: it has the right gradient only before the first step. Use the ratio.",
     ),
     "probability-instead-of-ratio": (
-        _plain_loss(_plain, lambda new, old: new.exp()),
+        _plain_loss(plain, lambda new, old: new.exp()),
         "The actions came from the old policy: divide by its probability.",
     ),
-    "clipped-already": (_plain_loss(_clip), "There is no clip in this loss yet: it is what the next exercise adds."),
+    "clipped-already": (_plain_loss(clip), "There is no clip in this loss yet: it is what the next exercise adds."),
     "means-multiplied": (
         _plain_loss(lambda r, a: -r.mean() * a.mean()),
         "The product of the means forgets which action had which advantage: multiply first, then average.",
@@ -344,7 +344,7 @@ SURROGATE_LOSS = Exercise(
         *wrong(_WRONG_SURROGATE_LOSSES),
         python_float(ch43.surrogate_loss),
         dtype_lost(ch43.surrogate_loss),
-        bad_input_accepted(_plain_loss(_plain, checked=False)),
+        bad_input_accepted(_plain_loss(plain, checked=False)),
     ),
     variants={
         "dot product": _plain_loss(lambda r, a: -(r @ a) / len(a)),
@@ -376,7 +376,7 @@ def _limits(r, a, e):
 
 def _cut_outside(r, a, e):
     """The right value, but no gradient wherever the ratio is outside."""
-    return _clip(torch.where((r - 1).abs() > e, r.detach(), r), a, e)
+    return clip(torch.where((r - 1).abs() > e, r.detach(), r), a, e)
 
 
 def _straight_through(r, a, e):
@@ -404,7 +404,7 @@ def clip_by_excess(r, a, e):
     return (a.abs() * excess - a * r).mean()
 
 
-_WRONG_CLIPPED_LOSSES = _wrong_losses(_clip, ch43.clipped_surrogate_loss, _NOT_NEGATIVE) | {
+_WRONG_CLIPPED_LOSSES = _wrong_losses(clip, ch43.clipped_surrogate_loss, _NOT_NEGATIVE) | {
     "max-instead-of-min": (
         _clipped_loss(lambda r, a, e: -torch.maximum(r * a, r.clamp(1 - e, 1 + e) * a).mean()),
         "Take the smaller of the two terms (the larger only once both are negated): max caps just the wrong side.",
@@ -413,7 +413,7 @@ _WRONG_CLIPPED_LOSSES = _wrong_losses(_clip, ch43.clipped_surrogate_loss, _NOT_N
         _clipped_loss(lambda r, a, e: -(r.clamp(1 - e, 1 + e) * a).mean()),
         "A sample that has moved the wrong way is stuck outside: take the minimum with the unclipped term.",
     ),
-    "not-clipped": (_clipped_loss(_plain), "Nothing is clipped: good actions gain without limit."),
+    "not-clipped": (_clipped_loss(plain), "Nothing is clipped: good actions gain without limit."),
     "range-on-log-ratio": (_clipped_to(lambda e: (math.exp(-e), math.exp(e))), _LOG_RANGE),
     "no-lower-bound": (_clipped_to(lambda e: (-INF, 1 + e)), "Bad actions have no limit: clip at 1 - ε as well."),
     "no-upper-bound": (_clipped_to(lambda e: (1 - e, INF)), "Good actions have no limit: clip at 1 + ε as well."),
@@ -430,8 +430,8 @@ _WRONG_CLIPPED_LOSSES = _wrong_losses(_clip, ch43.clipped_surrogate_loss, _NOT_N
         _clipped_loss(lambda r, a, e: -torch.minimum((r * a).mean(), (r.clamp(1 - e, 1 + e) * a).mean())),
         "Take the minimum sample by sample, then the mean: otherwise all samples are clipped, or none.",
     ),
-    "clip-range-ignored": (_clipped_loss(lambda r, a, e: _clip(r, a, 0.2)), _RANGE),
-    "zero-range-means-off": (_clipped_loss(lambda r, a, e: _clip(r, a, e or INF)), _ZERO),
+    "clip-range-ignored": (_clipped_loss(lambda r, a, e: clip(r, a, 0.2)), _RANGE),
+    "zero-range-means-off": (_clipped_loss(lambda r, a, e: clip(r, a, e or INF)), _ZERO),
     "infinity-times-zero": (
         _clipped_loss(_limits),
         "An infinite range times an advantage of 0 is NaN: clip the ratio before you multiply.",
@@ -456,7 +456,7 @@ CLIPPED_SURROGATE_LOSS = Exercise(
     reference=ch43.clipped_surrogate_loss,
     criteria={"values": 1.6, "gradient": 1.0, "dtype": 0.1, "inputs": 0.1, "errors": 0.2},
     cases=(
-        Case("a batch, default clip_range", _batch(), closed_form=_clip_by_cases, visible=True, draws=3),
+        Case("a batch, default clip_range", _batch(), closed_form=clip_by_cases, visible=True, draws=3),
         Case(
             "identical policies: minus the mean advantage",
             _constant(0.0),
@@ -465,16 +465,16 @@ CLIPPED_SURROGATE_LOSS = Exercise(
             draws=1,
         ),
         *(
-            Case(f"{how} action, ratio {where}", _one_action(side, sign), closed_form=_clip_by_cases, visible=True, draws=1)
+            Case(f"{how} action, ratio {where}", _one_action(side, sign), closed_form=clip_by_cases, visible=True, draws=1)
             for how, sign in (("a good", 1), ("a bad", -1))
             for where, side in (("above", 0.7), ("below", -0.7))
         ),
-        Case("clip_range = 0.05", _batch(clip_range=0.05), closed_form=_clip_by_cases, visible=True, draws=1),
-        Case("clip_range = 0", _batch(clip_range=0), closed_form=_clip_by_cases, visible=True, draws=1),
-        Case("clip_range = 1.5", _batch(spread=1.0, clip_range=1.5), closed_form=_clip_by_cases, draws=1),
-        Case("clip_range = infinity, one advantage is 0", _zero_advantage, closed_form=_clip_by_cases, visible=True, draws=1),
-        Case("very unlikely actions", _batch(base=-900.0), closed_form=_clip_by_cases, visible=True, draws=1),
-        Case("log-ratios around ±20", _quadrants(20.0), closed_form=_clip_by_cases, draws=1),
+        Case("clip_range = 0.05", _batch(clip_range=0.05), closed_form=clip_by_cases, visible=True, draws=1),
+        Case("clip_range = 0", _batch(clip_range=0), closed_form=clip_by_cases, visible=True, draws=1),
+        Case("clip_range = 1.5", _batch(spread=1.0, clip_range=1.5), closed_form=clip_by_cases, draws=1),
+        Case("clip_range = infinity, one advantage is 0", _zero_advantage, closed_form=clip_by_cases, visible=True, draws=1),
+        Case("very unlikely actions", _batch(base=-900.0), closed_form=clip_by_cases, visible=True, draws=1),
+        Case("log-ratios around ±20", _quadrants(20.0), closed_form=clip_by_cases, draws=1),
         Case("all inputs require gradient", _batch(), differentiate=TRIPLE, visible=True),
         Case("gradient where the policies are identical", _constant(0.0), differentiate=TRIPLE, visible=True, draws=1),
         Case("gradient well outside", _quadrants(1.0), differentiate=TRIPLE, visible=True, draws=1),
@@ -488,7 +488,7 @@ CLIPPED_SURROGATE_LOSS = Exercise(
         *wrong(_WRONG_CLIPPED_LOSSES),
         python_float(ch43.clipped_surrogate_loss),
         dtype_lost(ch43.clipped_surrogate_loss),
-        bad_input_accepted(_clipped_loss(_clip, checked=False)),
+        bad_input_accepted(_clipped_loss(clip, checked=False)),
     ),
     variants={
         "maximum of the negated terms": _clipped_loss(
@@ -723,7 +723,7 @@ def _standstill(generator):
 
 
 def _losses_by_cases(log_probs, advantages, clip_range=0.2):
-    return torch.stack([_clip_by_cases(current, log_probs[0], advantages, clip_range) for current in log_probs])
+    return torch.stack([clip_by_cases(current, log_probs[0], advantages, clip_range) for current in log_probs])
 
 
 def _epochs(old=lambda log_probs, epoch: log_probs[0], loss=ch43.clipped_surrogate_loss):
@@ -740,7 +740,7 @@ def _of_all_epochs(objective):
     """Another: `objective` takes the log-ratios (K, B), the advantages and the clip range, and gives K losses."""
 
     def version(log_probs, advantages, clip_range=0.2):
-        _clipped_loss(_clip)(log_probs[0], log_probs[0], advantages, clip_range)  # refuses what is to be refused
+        _clipped_loss(clip)(log_probs[0], log_probs[0], advantages, clip_range)  # refuses what is to be refused
         return objective(log_probs - log_probs[0].detach(), advantages.detach(), clip_range)
 
     return version
@@ -763,7 +763,7 @@ _WRONG_REPAIRS = {
         "This is the suspect program's own bug. What is the ratio in every epoch, and when can it reach a bound?",
     ),
     "old-from-current-epoch-with-graph": (
-        _epochs(lambda log_probs, epoch: log_probs[epoch], _old_leaks(_clip)),
+        _epochs(lambda log_probs, epoch: log_probs[epoch], _old_leaks(clip)),
         "The ratio is a policy over itself: it is 1 in every epoch, and without detach its two gradients cancel as well.",
     ),
     "old-from-previous-epoch": (
@@ -784,17 +784,17 @@ _WRONG_REPAIRS = {
 
 _WRONG_EPOCHS = {
     "gradient-into-old-log-probs": (
-        _old_leaks(_clip),
+        _old_leaks(clip),
         "Row 0 receives gradient from later epochs too: as old log-probabilities it is data, so detach it.",
     ),
-    "gradient-into-advantages": (_advantages_leak(_clip), _CRITIC),
+    "gradient-into-advantages": (_advantages_leak(clip), _CRITIC),
     "nothing-detached": (
-        _clipped_loss(_clip, leak=True),
+        _clipped_loss(clip, leak=True),
         "Gradient reaches row 0 as old log-probabilities, and the advantages: both are data of the rollout, detach them.",
     ),
-    "not-clipped": (_clipped_loss(_plain), "The ratio is right again, but nothing is clipped."),
-    "sum-instead-of-mean": (_clipped_loss(lambda r, a, e: _clip(r, a, e) * len(a)), _SUM),
-    "clip-range-ignored": (_clipped_loss(lambda r, a, e: _clip(r, a, 0.2)), _RANGE),
+    "not-clipped": (_clipped_loss(plain), "The ratio is right again, but nothing is clipped."),
+    "sum-instead-of-mean": (_clipped_loss(lambda r, a, e: clip(r, a, e) * len(a)), _SUM),
+    "clip-range-ignored": (_clipped_loss(lambda r, a, e: clip(r, a, 0.2)), _RANGE),
 }
 
 REPAIRED_LOSSES = Exercise(
@@ -835,7 +835,7 @@ REPAIRED_LOSSES = Exercise(
         *wrong(_WRONG_REPAIRS),
         *wrong(_WRONG_EPOCHS, lambda loss: _epochs(loss=loss)),
         dtype_lost(ch43.repaired_losses),
-        bad_input_accepted(_epochs(loss=_clipped_loss(_clip, checked=False))),
+        bad_input_accepted(_epochs(loss=_clipped_loss(clip, checked=False))),
     ),
     variants={
         "all epochs at once": _of_all_epochs(

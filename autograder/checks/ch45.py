@@ -9,7 +9,24 @@ import numpy as np
 import torch
 from torch.distributions import Independent, Normal
 
-from autograder.authoring.spec import Artefact, Case, Exercise, Misconception
+from autograder.authoring.parts import (
+    DTYPE,
+    after,
+    bad_input_accepted,
+    cut_from_graph,
+    dtype_lost,
+    in_place,
+    integers,
+    normal,
+    one_shape,
+    replaced,
+    reshaped,
+    satisfies,
+    versions_of,
+    wrong,
+)
+from autograder.authoring.spec import Artefact, Case, Exercise
+from autograder.checks.ch43 import clip, clip_by_cases, clip_by_excess, clip_by_mask, normalised, off_bounds, plain
 from course_lib.checks.cases import built
 from course_lib.control import envs as environments
 from course_lib.control.policies import make_policy
@@ -19,45 +36,10 @@ from solutions import ch43, ch45
 INF = math.inf
 HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 
-# ---------------------------------------------------------------------------------------------------------------- inputs
-
-
-def _normal(generator, *shape):
-    return torch.randn(shape, generator=generator, dtype=torch.float64)
-
-
-def _with(inputs, **changes):
-    return lambda generator: inputs(generator) | changes
-
-
-def _changed(inputs, **changes):
-    """The inputs with some of them replaced by a function of themselves."""
-
-    def wrong(generator):
-        drawn = inputs(generator)
-        return drawn | {name: change(drawn[name]) for name, change in changes.items()}
-
-    return wrong
-
 
 def _case(name, inputs, **options):
     """A case that is either visible or hidden, unless `draws` says otherwise: what it asks for is asked for in others, too."""
     return Case(name, inputs, **({"draws": 0 if options.get("visible") else 1} | options))
-
-
-# ---------------------------------------------------------------------------------------------- wrong answers, in general
-
-_DTYPE = "The result has lost the inputs' dtype: make constants Python floats, cast masks with .to(x.dtype), and avoid .float()."
-_SCALAR = "Return a 0-dim tensor, not a Python float: .item() cuts the graph that the optimiser needs."
-_VALIDATE = (
-    "Shapes that differ broadcast silently, and the result is a number all the same. Check the arguments first; "
-    "the error names the argument, the rule and what it got."
-)
-
-
-def _after(function, change):
-    """Right, and then spoilt."""
-    return lambda *args, **kwargs: change(function(*args, **kwargs))
 
 
 # ----------------------------------------------------------------------------------------------------- gaussian_log_prob
@@ -67,9 +49,9 @@ def _actions(size=7, dims=3, spread=1.0, per_sample=False, base=-0.4):
     """Actions at `spread` standard deviations from the mean or so."""
 
     def inputs(generator):
-        mean = _normal(generator, size, dims)
-        log_std = base + 0.5 * _normal(generator, *((size, dims) if per_sample else (dims,)))
-        return {"mean": mean, "log_std": log_std, "actions": mean + spread * log_std.exp() * _normal(generator, size, dims)}
+        mean = normal(generator, size, dims)
+        log_std = base + 0.5 * normal(generator, *((size, dims) if per_sample else (dims,)))
+        return {"mean": mean, "log_std": log_std, "actions": mean + spread * log_std.exp() * normal(generator, size, dims)}
 
     return inputs
 
@@ -93,37 +75,24 @@ def _density_by_hand(mean, log_std, actions):
     return torch.tensor(sums, dtype=mean.dtype)
 
 
-def _refuse_actions(mean, log_std, actions):
-    """Another style of validation than the reference's."""
-    if actions.shape != mean.shape:
-        raise ValueError(f"mean {tuple(mean.shape)} and actions {tuple(actions.shape)} belong together")
-    if tuple(log_std.shape) not in (tuple(mean.shape), tuple(mean.shape[1:])):
-        raise ValueError(f"log_std is (A,) or (B, A) beside a mean {tuple(mean.shape)}, but it is {tuple(log_std.shape)}")
+_densities = versions_of(
+    ch45.gaussian_log_prob,
+    one_shape("mean", "actions"),
+    satisfies(lambda log_std, mean: log_std.shape in (mean.shape, mean.shape[1:])),
+)
 
 
-def _density(terms, checked=True):
-    """A version of the function: `terms` takes z = (a - mean) / std, log_std as (B, A), and gives the (B,) sums."""
-
-    def version(mean, log_std, actions):
-        if checked:
-            _refuse_actions(mean, log_std, actions)
-        return terms((actions - mean) / log_std.exp(), log_std.expand(actions.shape) if checked else log_std)
-
-    return version
+def _density(terms):
+    """A version whose `terms` take z = (a - mean) / std and log_std, both (B, A), and give the (B,) sums."""
+    return _densities(lambda m, s, a: terms((a - m) / s.exp(), s.expand(a.shape)))
 
 
 def _by_dimension(z, log_std):
     return -0.5 * z**2 - log_std - HALF_LOG_TWO_PI
 
 
-def _raw_density(formula):
-    """The same, but `formula` takes the function's own arguments."""
-
-    def version(mean, log_std, actions):
-        _refuse_actions(mean, log_std, actions)
-        return formula(mean, log_std, actions)
-
-    return version
+def _summed(z, log_std):
+    return _by_dimension(z, log_std).sum(-1)
 
 
 def _log_of_densities(mean, log_std, actions):
@@ -132,10 +101,88 @@ def _log_of_densities(mean, log_std, actions):
     return densities.prod(-1).log()
 
 
-def _in_place_difference(mean, log_std, actions):
-    actions -= mean
-    return _by_dimension(actions / log_std.exp(), log_std).sum(-1)
+_WRONG_TERMS = {
+    "not-summed": (
+        _by_dimension,
+        "One number for each sample, (B,): the dimensions are independent, so their log-densities add up.",
+    ),
+    "averaged-over-dimensions": (
+        lambda z, s: _by_dimension(z, s).mean(-1),
+        "This is the mean over the action's dimensions. A joint density is a product: take the sum of the logarithms.",
+    ),
+    "summed-over-samples": (
+        lambda z, s: _by_dimension(z, s).sum(0),
+        "Sum over the action's dimensions, the last axis, not over the samples.",
+    ),
+    "summed-over-everything": (
+        lambda z, s: _by_dimension(z, s).sum(),
+        "One number for each sample, (B,): sum over the last axis only.",
+    ),
+    "half-missing": (
+        lambda z, s: (-(z**2) - s - HALF_LOG_TWO_PI).sum(-1),
+        "The exponent of the normal density is -z² / 2: the half is missing.",
+    ),
+    "two-pi-missing": (
+        lambda z, s: (-0.5 * z**2 - s).sum(-1),
+        "The constant ½ log 2π of each dimension is missing. Ratios do not see it; a logged log-probability does.",
+    ),
+    "two-pi-once": (
+        lambda z, s: (-0.5 * z**2 - s).sum(-1) - HALF_LOG_TWO_PI,
+        "½ log 2π belongs to every dimension; here it is subtracted once for each sample.",
+    ),
+    "two-pi-not-halved": (
+        lambda z, s: (-0.5 * z**2 - s - 2 * HALF_LOG_TWO_PI).sum(-1),
+        "The density has 2π under a square root, so its logarithm has ½ log 2π.",
+    ),
+    "width-not-normalised": (
+        lambda z, s: (-0.5 * z**2 - HALF_LOG_TWO_PI).sum(-1),
+        "A wider density is a lower one: -log σ of each dimension is missing, and σ grows without bound.",
+    ),
+    "width-with-the-wrong-sign": (
+        lambda z, s: (-0.5 * z**2 + s - HALF_LOG_TWO_PI).sum(-1),
+        "A wider density is a lower one: subtract log σ.",
+    ),
+    "sign-missing": (
+        lambda z, s: -_summed(z, s),
+        "This is the negative log-likelihood, which one minimises. A ratio needs the log-probability itself.",
+    ),
+    "density-instead-of-logarithm": (
+        lambda z, s: _summed(z, s).exp(),
+        "This is the density itself; return its logarithm.",
+    ),
+    "log-std-clamped": (
+        lambda z, s: _by_dimension(z * (s - s.clamp(-20, 2)).exp(), s.clamp(-20, 2)).sum(-1),
+        "log_std is clamped here. Where a policy limits its width is the policy's affair: use log_std as it comes.",
+    ),
+}
 
+_WRONG_DENSITIES = {
+    "log-std-taken-as-std": (
+        lambda m, s, a: (-0.5 * ((a - m) / s) ** 2 - s.abs().log() - HALF_LOG_TWO_PI).sum(-1),
+        "log_std is the logarithm of the standard deviation: take its exponential before dividing.",
+    ),
+    "log-std-taken-as-log-variance": (
+        lambda m, s, a: _by_dimension((a - m) / (0.5 * s).exp(), 0.5 * s).sum(-1),
+        "log_std is log σ, not log σ²: the standard deviation is exp(log_std).",
+    ),
+    "variance-not-squared": (
+        lambda m, s, a: (-0.5 * (a - m) ** 2 / s.exp() - s - HALF_LOG_TWO_PI).sum(-1),
+        "The squared distance is divided by the variance σ², here it is divided by σ.",
+    ),
+    "logarithm-of-the-density": (
+        _log_of_densities,
+        "Far from the mean, or in many dimensions, the density is 0 to the computer and its logarithm is -inf: "
+        "add logarithms, never form the density.",
+    ),
+    "log-std-detached": (
+        lambda m, s, a: _by_dimension((a - m) / s.detach().exp(), s.detach()).sum(-1),
+        "No gradient reaches log_std: the policy would never learn how much to explore.",
+    ),
+    "mean-detached": (
+        lambda m, s, a: _by_dimension((a - m.detach()) / s.exp(), s).sum(-1),
+        "No gradient reaches the mean: the policy would never learn what to do.",
+    ),
+}
 
 GAUSSIAN_LOG_PROB = Exercise(
     name="gaussian_log_prob",
@@ -156,141 +203,43 @@ GAUSSIAN_LOG_PROB = Exercise(
         _case("single precision", _actions(), dtype=torch.float32, visible=True),
         _case(
             "actions with a dimension too few",
-            _changed(_actions(), actions=lambda a: a[:, :1]),
+            reshaped(_actions(), "actions", lambda a: a[:, :1]),
             raises=("actions", "mean"),
             visible=True,
         ),
-        _case("actions of one sample", _changed(_actions(), actions=lambda a: a[:1]), raises=("actions", "mean")),
+        _case("actions of one sample", reshaped(_actions(), "actions", lambda a: a[:1]), raises=("actions", "mean")),
         _case(
             "log_std for another number of dimensions",
-            _changed(_actions(), log_std=lambda s: s[:1]),
+            reshaped(_actions(), "log_std", lambda s: s[:1]),
             raises=("log_std",),
             visible=True,
         ),
         _case(
             "log_std as a column, one for each sample",
-            _changed(_actions(per_sample=True), log_std=lambda s: s[:, :1]),
+            reshaped(_actions(per_sample=True), "log_std", lambda s: s[:, :1]),
             raises=("log_std",),
         ),
     ),
     misconceptions=(
-        Misconception(
-            "not-summed",
-            _density(_by_dimension),
-            "One number for each sample, (B,): the dimensions are independent, so their log-densities add up.",
-        ),
-        Misconception(
-            "averaged-over-dimensions",
-            _density(lambda z, s: _by_dimension(z, s).mean(-1)),
-            "This is the mean over the action's dimensions. A joint density is a product: take the sum of the logarithms.",
-        ),
-        Misconception(
-            "summed-over-samples",
-            _density(lambda z, s: _by_dimension(z, s).sum(0)),
-            "Sum over the action's dimensions, the last axis, not over the samples.",
-        ),
-        Misconception(
-            "summed-over-everything",
-            _density(lambda z, s: _by_dimension(z, s).sum()),
-            "One number for each sample, (B,): sum over the last axis only.",
-        ),
-        Misconception(
-            "log-std-taken-as-std",
-            _raw_density(lambda m, s, a: (-0.5 * ((a - m) / s) ** 2 - s.abs().log() - HALF_LOG_TWO_PI).sum(-1)),
-            "log_std is the logarithm of the standard deviation: take its exponential before dividing.",
-        ),
-        Misconception(
-            "log-std-taken-as-log-variance",
-            _raw_density(lambda m, s, a: _by_dimension((a - m) / (0.5 * s).exp(), 0.5 * s).sum(-1)),
-            "log_std is log σ, not log σ²: the standard deviation is exp(log_std).",
-        ),
-        Misconception(
-            "variance-not-squared",
-            _raw_density(lambda m, s, a: (-0.5 * (a - m) ** 2 / s.exp() - s - HALF_LOG_TWO_PI).sum(-1)),
-            "The squared distance is divided by the variance σ², here it is divided by σ.",
-        ),
-        Misconception(
-            "half-missing",
-            _density(lambda z, s: (-(z**2) - s - HALF_LOG_TWO_PI).sum(-1)),
-            "The exponent of the normal density is -z² / 2: the half is missing.",
-        ),
-        Misconception(
-            "two-pi-missing",
-            _density(lambda z, s: (-0.5 * z**2 - s).sum(-1)),
-            "The constant ½ log 2π of each dimension is missing. Ratios do not see it; a logged log-probability does.",
-        ),
-        Misconception(
-            "two-pi-once",
-            _density(lambda z, s: (-0.5 * z**2 - s).sum(-1) - HALF_LOG_TWO_PI),
-            "½ log 2π belongs to every dimension; here it is subtracted once for each sample.",
-        ),
-        Misconception(
-            "two-pi-not-halved",
-            _density(lambda z, s: (-0.5 * z**2 - s - 2 * HALF_LOG_TWO_PI).sum(-1)),
-            "The density has 2π under a square root, so its logarithm has ½ log 2π.",
-        ),
-        Misconception(
-            "width-not-normalised",
-            _density(lambda z, s: (-0.5 * z**2 - HALF_LOG_TWO_PI).sum(-1)),
-            "A wider density is a lower one: -log σ of each dimension is missing, and σ grows without bound.",
-        ),
-        Misconception(
-            "width-with-the-wrong-sign",
-            _density(lambda z, s: (-0.5 * z**2 + s - HALF_LOG_TWO_PI).sum(-1)),
-            "A wider density is a lower one: subtract log σ.",
-        ),
-        Misconception(
-            "sign-missing",
-            _after(_density(lambda z, s: _by_dimension(z, s).sum(-1)), torch.neg),
-            "This is the negative log-likelihood, which one minimises. A ratio needs the log-probability itself.",
-        ),
-        Misconception(
-            "density-instead-of-logarithm",
-            _after(_density(lambda z, s: _by_dimension(z, s).sum(-1)), torch.exp),
-            "This is the density itself; return its logarithm.",
-        ),
-        Misconception(
-            "logarithm-of-the-density",
-            _raw_density(_log_of_densities),
-            "Far from the mean, or in many dimensions, the density is 0 to the computer and its logarithm is -inf: "
-            "add logarithms, never form the density.",
-        ),
-        Misconception(
-            "log-std-clamped",
-            _density(lambda z, s: _by_dimension(z * (s - s.clamp(-20, 2)).exp(), s.clamp(-20, 2)).sum(-1)),
-            "log_std is clamped here. Where a policy limits its width is the policy's affair: use log_std as it comes.",
-        ),
-        Misconception(
-            "log-std-detached",
-            _raw_density(lambda m, s, a: _by_dimension((a - m) / s.detach().exp(), s.detach()).sum(-1)),
-            "No gradient reaches log_std: the policy would never learn how much to explore.",
-        ),
-        Misconception(
-            "mean-detached",
-            _raw_density(lambda m, s, a: _by_dimension((a - m.detach()) / s.exp(), s).sum(-1)),
-            "No gradient reaches the mean: the policy would never learn what to do.",
-        ),
-        Misconception("dtype-lost", _after(ch45.gaussian_log_prob, torch.Tensor.float), _DTYPE),
-        Misconception(
-            "actions-changed-in-place",
-            _raw_density(_in_place_difference),
-            "The caller's actions are changed (by -= or a method that ends in _), and the next epoch finds others: make a new tensor.",
-        ),
-        Misconception("bad-input-accepted", _density(lambda z, s: _by_dimension(z, s).sum(-1), checked=False), _VALIDATE),
+        *wrong(_WRONG_TERMS, _density),
+        *wrong(_WRONG_DENSITIES, _densities),
+        dtype_lost(ch45.gaussian_log_prob),
+        in_place(_density(_summed), "actions", 2),
+        bad_input_accepted(_densities(lambda m, s, a: _by_dimension((a - m) / s.exp(), s).sum(-1), checked=False)),
     ),
     variants={
-        "torch.distributions": _raw_density(lambda m, s, a: Independent(Normal(m, s.exp()), 1).log_prob(a)),
-        "torch.distributions, summed": _raw_density(lambda m, s, a: Normal(m, torch.exp(s)).log_prob(a).sum(dim=1)),
-        "one dimension after the other": _raw_density(
+        "torch.distributions": _densities(lambda m, s, a: Independent(Normal(m, s.exp()), 1).log_prob(a)),
+        "torch.distributions, summed": _densities(lambda m, s, a: Normal(m, torch.exp(s)).log_prob(a).sum(dim=1)),
+        "one dimension after the other": _densities(
             lambda m, s, a: sum(
                 _by_dimension((a[:, i] - m[:, i]) * (-s.expand_as(m)[:, i]).exp(), s.expand_as(m)[:, i])
                 for i in range(m.shape[1])
             )
         ),
-        "variance and its logarithm": _raw_density(
+        "variance and its logarithm": _densities(
             lambda m, s, a: -0.5 * ((a - m).square() / (2 * s).exp() + 2 * s + math.log(2 * math.pi)).sum(-1)
         ),
-        "one sample at a time, double precision inside": _raw_density(
+        "one sample at a time, double precision inside": _densities(
             lambda m, s, a: torch.stack(
                 [
                     _by_dimension((x - y).double() / w.double().exp(), w.double()).sum()
@@ -307,7 +256,7 @@ _CONSTANT = 0.5 + HALF_LOG_TWO_PI
 
 
 def _widths(*shape, base=-0.5):
-    return lambda generator: {"log_std": base + 0.7 * _normal(generator, *shape)}
+    return lambda generator: {"log_std": base + 0.7 * normal(generator, *shape)}
 
 
 def _negated_mean_log_density(log_std):
@@ -318,9 +267,44 @@ def _negated_mean_log_density(log_std):
     return (standard + log_std).sum(-1)
 
 
-def _entropy(formula):
-    return lambda log_std: formula(log_std)
-
+_WRONG_ENTROPIES = {
+    "not-summed": (lambda s: s + _CONSTANT, "The entropies of independent dimensions add up: sum over the last axis."),
+    "averaged-over-dimensions": (
+        lambda s: (s + _CONSTANT).mean(-1),
+        "The entropies of independent dimensions add up; this is their mean.",
+    ),
+    "summed-over-samples": (lambda s: (s + _CONSTANT).sum(), "One entropy for each sample: sum over the last axis only."),
+    "averaged-over-samples": (
+        lambda s: (s + _CONSTANT).sum(-1).mean(),
+        "One entropy for each sample; the loss takes the mean over the batch.",
+    ),
+    "constant-missing": (
+        lambda s: s.sum(-1),
+        "Each dimension adds ½ (1 + log 2π) to log σ. Gradients do not see it; a logged entropy does.",
+    ),
+    "constant-once": (lambda s: s.sum(-1) + _CONSTANT, "The constant ½ (1 + log 2π) belongs to every dimension."),
+    "half-of-z-squared-missing": (
+        lambda s: (s + HALF_LOG_TWO_PI).sum(-1),
+        "This is minus the log-density at the mean. On average z²/2 is ½, which each dimension adds.",
+    ),
+    "constant-not-halved": (
+        lambda s: (s + 2 * _CONSTANT).sum(-1),
+        "The constant is ½ (1 + log 2π) = 1.42 for each dimension; the half is missing.",
+    ),
+    "std-instead-of-its-logarithm": (
+        lambda s: (s.exp() + _CONSTANT).sum(-1),
+        "The entropy grows with log σ, not with σ. A narrow density has a negative entropy.",
+    ),
+    "log-std-taken-as-log-variance": (
+        lambda s: (0.5 * s + _CONSTANT).sum(-1),
+        "log_std is log σ, not log σ²: the entropy has slope 1 in it.",
+    ),
+    "never-negative": (
+        lambda s: (s + _CONSTANT).sum(-1).clamp_min(0),
+        "The entropy of a density may be negative: a clamp at 0 takes the gradient away.",
+    ),
+    "sign-missing": (lambda s: -(s + _CONSTANT).sum(-1), "Entropy is minus the mean log-density: a wider policy has more of it."),
+}
 
 GAUSSIAN_ENTROPY = Exercise(
     name="gaussian_entropy",
@@ -339,77 +323,10 @@ GAUSSIAN_ENTROPY = Exercise(
         _case("single precision", _widths(3), dtype=torch.float32, visible=True),
     ),
     misconceptions=(
-        Misconception(
-            "not-summed",
-            _entropy(lambda s: s + _CONSTANT),
-            "The entropies of independent dimensions add up: sum over the last axis.",
-        ),
-        Misconception(
-            "averaged-over-dimensions",
-            _entropy(lambda s: (s + _CONSTANT).mean(-1)),
-            "The entropies of independent dimensions add up; this is their mean.",
-        ),
-        Misconception(
-            "summed-over-samples",
-            _entropy(lambda s: (s + _CONSTANT).sum()),
-            "One entropy for each sample: sum over the last axis only.",
-        ),
-        Misconception(
-            "averaged-over-samples",
-            _entropy(lambda s: (s + _CONSTANT).sum(-1).mean()),
-            "One entropy for each sample; the loss takes the mean over the batch.",
-        ),
-        Misconception(
-            "constant-missing",
-            _entropy(lambda s: s.sum(-1)),
-            "Each dimension adds ½ (1 + log 2π) to log σ. Gradients do not see it; a logged entropy does.",
-        ),
-        Misconception(
-            "constant-once",
-            _entropy(lambda s: s.sum(-1) + _CONSTANT),
-            "The constant ½ (1 + log 2π) belongs to every dimension.",
-        ),
-        Misconception(
-            "half-of-z-squared-missing",
-            _entropy(lambda s: (s + HALF_LOG_TWO_PI).sum(-1)),
-            "This is minus the log-density at the mean. On average z²/2 is ½, which each dimension adds.",
-        ),
-        Misconception(
-            "constant-not-halved",
-            _entropy(lambda s: (s + 2 * _CONSTANT).sum(-1)),
-            "The constant is ½ (1 + log 2π) = 1.42 for each dimension; the half is missing.",
-        ),
-        Misconception(
-            "std-instead-of-its-logarithm",
-            _entropy(lambda s: (s.exp() + _CONSTANT).sum(-1)),
-            "The entropy grows with log σ, not with σ. A narrow density has a negative entropy.",
-        ),
-        Misconception(
-            "log-std-taken-as-log-variance",
-            _entropy(lambda s: (0.5 * s + _CONSTANT).sum(-1)),
-            "log_std is log σ, not log σ²: the entropy has slope 1 in it.",
-        ),
-        Misconception(
-            "never-negative",
-            _entropy(lambda s: (s + _CONSTANT).sum(-1).clamp_min(0)),
-            "The entropy of a density may be negative: a clamp at 0 takes the gradient away.",
-        ),
-        Misconception(
-            "sign-missing",
-            _entropy(lambda s: -(s + _CONSTANT).sum(-1)),
-            "Entropy is minus the mean log-density: a wider policy has more of it.",
-        ),
-        Misconception(
-            "no-gradient",
-            _after(ch45.gaussian_entropy, torch.Tensor.detach),
-            "The bonus is there for its gradient: do not detach.",
-        ),
-        Misconception("dtype-lost", _after(ch45.gaussian_entropy, torch.Tensor.float), _DTYPE),
-        Misconception(
-            "log-std-changed-in-place",
-            lambda log_std: log_std.add_(_CONSTANT).sum(-1),
-            "The caller's log_std is changed, and it is a parameter of the policy: make a new tensor.",
-        ),
+        *wrong(_WRONG_ENTROPIES),
+        cut_from_graph(ch45.gaussian_entropy),
+        dtype_lost(ch45.gaussian_entropy),
+        in_place(ch45.gaussian_entropy, "log_std"),
     ),
     variants={
         "torch.distributions": lambda log_std: Normal(torch.zeros_like(log_std), log_std.exp()).entropy().sum(-1),
@@ -427,7 +344,7 @@ GAUSSIAN_ENTROPY = Exercise(
 
 def _epochs(batch_size, minibatch_size):
     def inputs(generator):
-        seed = int(torch.randint(2**31, (), generator=generator))
+        seed = int(integers(generator, 0, 2**31))
         sizes = {"batch_size": batch_size, "minibatch_size": minibatch_size}
         return sizes | {"generator": built("seeding.generator", seed=seed)}
 
@@ -439,16 +356,9 @@ def _epoch_case(name, batch_size, minibatch_size, **options):
     return _case(name, _epochs(batch_size, minibatch_size), repeat=2, view="epochs", **options)
 
 
-def _sized(version):
-    """A version of the function that refuses what the reference refuses."""
-
-    def checked(batch_size, minibatch_size, generator):
-        for name, size in (("batch_size", batch_size), ("minibatch_size", minibatch_size)):
-            if not size > 0:
-                raise ValueError(f"{name} is {size}, but it counts samples and must be positive")
-        return version(batch_size, minibatch_size, generator)
-
-    return checked
+_sized = versions_of(
+    ch45.minibatches, satisfies(lambda batch_size: batch_size > 0), satisfies(lambda minibatch_size: minibatch_size > 0)
+)
 
 
 def _order(order, drop_last=False):
@@ -529,6 +439,69 @@ def _by_data_loader(batch_size, minibatch_size, generator):
         yield torch.tensor(batch)
 
 
+_WRONG_ORDERS = {
+    "never-shuffled": (
+        lambda size, generator: torch.arange(size),
+        "The indices come in order: neighbours in time fill each batch, and they are alike. Draw a random order.",
+    ),
+    "drawn-with-replacement": (
+        lambda size, generator: torch.randint(size, (size,), generator=generator),
+        "Some indices come twice and others never: an epoch is a permutation, such as torch.randperm gives.",
+    ),
+    "same-order-every-epoch": (
+        lambda size, _: torch.randperm(size, generator=torch.Generator().manual_seed(0)),
+        "Each epoch has the same order: a generator of your own, seeded anew in each call, repeats itself. Use the one given.",
+    ),
+    "generator-not-used": (
+        lambda size, _: torch.randperm(size),
+        "The order is random but not drawn from the given generator, so that nobody can repeat your run: "
+        "torch.randperm takes generator=….",
+    ),
+}
+
+_WRONG_MINIBATCHES = {
+    "last-batch-dropped": (
+        _order(_permutation, drop_last=True),
+        "The short last batch is dropped: these samples are never used in this epoch. Keep it.",
+    ),
+    "last-batch-filled-up": (
+        _last_batch_filled_up,
+        "The last batch is filled up with indices that were there before: each index comes exactly once in an epoch.",
+    ),
+    "new-order-for-each-batch": (
+        _with_replacement_between_batches,
+        "A fresh permutation for each batch forgets which samples were used: draw one for the whole epoch, and cut it.",
+    ),
+    "shuffled-within-batches": (
+        _shuffled_within,
+        "Each batch holds consecutive samples, only their order within it is random: shuffle first, then cut.",
+    ),
+    "batches-shuffled": (
+        _batches_shuffled,
+        "The batches come in random order, but each holds consecutive samples: shuffle first, then cut.",
+    ),
+    "equal-parts": (
+        _equal_parts,
+        "The batches are of equal size rather than of the size asked for: only the last one may be shorter.",
+    ),
+    "one-tensor": (
+        _sized(lambda batch_size, _, generator: torch.randperm(batch_size, generator=generator)),
+        "This is the whole order in one tensor: yield it piece by piece, minibatch_size indices at a time.",
+    ),
+    "lists-instead-of-tensors": (
+        lambda *given: (batch.tolist() for batch in ch45.minibatches(*given)),
+        "Each batch is a list of numbers: yield int64 tensors, which index other tensors without a detour.",
+    ),
+    "not-int64": (
+        lambda *given: (batch.to(torch.int32) for batch in ch45.minibatches(*given)),
+        "Index tensors are int64 by contract.",
+    ),
+    "counted-from-one": (
+        lambda *given: (batch + 1 for batch in ch45.minibatches(*given)),
+        "Indices run from 0 to batch_size - 1.",
+    ),
+}
+
 MINIBATCHES = Exercise(
     name="minibatches",
     reference=ch45.minibatches,
@@ -546,81 +519,11 @@ MINIBATCHES = Exercise(
         _case("minibatch_size = -1", _epochs(16, -1), raises=("minibatch_size",)),
     ),
     misconceptions=(
-        Misconception(
-            "never-shuffled",
-            _order(lambda size, generator: torch.arange(size)),
-            "The indices come in order: neighbours in time fill each batch, and they are alike. Draw a random order.",
-        ),
-        Misconception(
-            "last-batch-dropped",
-            _order(_permutation, drop_last=True),
-            "The short last batch is dropped: these samples are never used in this epoch. Keep it.",
-        ),
-        Misconception(
-            "last-batch-filled-up",
-            _last_batch_filled_up,
-            "The last batch is filled up with indices that were there before: each index comes exactly once in an epoch.",
-        ),
-        Misconception(
-            "drawn-with-replacement",
-            _order(lambda size, generator: torch.randint(size, (size,), generator=generator)),
-            "Some indices come twice and others never: an epoch is a permutation, such as torch.randperm gives.",
-        ),
-        Misconception(
-            "new-order-for-each-batch",
-            _with_replacement_between_batches,
-            "A fresh permutation for each batch forgets which samples were used: draw one for the whole epoch, and cut it.",
-        ),
-        Misconception(
-            "same-order-every-epoch",
-            _order(lambda size, _: torch.randperm(size, generator=torch.Generator().manual_seed(0))),
-            "Each epoch has the same order: a generator of your own, seeded anew in each call, repeats itself. Use the one given.",
-        ),
-        Misconception(
-            "generator-not-used",
-            _order(lambda size, _: torch.randperm(size)),
-            "The order is random but not drawn from the given generator, so that nobody can repeat your run: "
-            "torch.randperm takes generator=….",
-        ),
-        Misconception(
-            "shuffled-within-batches",
-            _shuffled_within,
-            "Each batch holds consecutive samples, only their order within it is random: shuffle first, then cut.",
-        ),
-        Misconception(
-            "batches-shuffled",
-            _batches_shuffled,
-            "The batches come in random order, but each holds consecutive samples: shuffle first, then cut.",
-        ),
-        Misconception(
-            "equal-parts",
-            _equal_parts,
-            "The batches are of equal size rather than of the size asked for: only the last one may be shorter.",
-        ),
-        Misconception(
-            "one-tensor",
-            _sized(lambda batch_size, _, generator: torch.randperm(batch_size, generator=generator)),
-            "This is the whole order in one tensor: yield it piece by piece, minibatch_size indices at a time.",
-        ),
-        Misconception(
-            "lists-instead-of-tensors",
-            lambda *given: (batch.tolist() for batch in ch45.minibatches(*given)),
-            "Each batch is a list of numbers: yield int64 tensors, which index other tensors without a detour.",
-        ),
-        Misconception(
-            "not-int64",
-            lambda *given: (batch.to(torch.int32) for batch in ch45.minibatches(*given)),
-            "Index tensors are int64 by contract.",
-        ),
-        Misconception(
-            "bad-input-accepted",
+        *wrong(_WRONG_ORDERS, _order),
+        *wrong(_WRONG_MINIBATCHES),
+        bad_input_accepted(
             lambda size, minibatch_size, generator: torch.randperm(size, generator=generator).split(abs(minibatch_size) or size),
             "Sizes below 1 make no minibatches: raise a ValueError that names the argument and its value.",
-        ),
-        Misconception(
-            "counted-from-one",
-            lambda *given: (batch + 1 for batch in ch45.minibatches(*given)),
-            "Indices run from 0 to batch_size - 1.",
         ),
     ),
     variants={
@@ -637,26 +540,20 @@ MINIBATCHES = Exercise(
 # -------------------------------------------------------------------------------------------------------------- ppo_loss
 
 
-def _off_bounds(log_ratio, clip_range):
-    """The same log-ratios, moved where the ratio is within 0.01 of a bound: there neither gradient nor count is graded."""
-    near = ((log_ratio.expm1().abs() - clip_range).abs() < 0.01) & (log_ratio != 0)
-    return torch.where(near, log_ratio + 0.03, log_ratio)
-
-
 def _update(size=33, spread=0.4, base=-2.0, shared_entropy=False, clip_range=0.2, vf_coef=0.5, ent_coef=0.01):
     """A minibatch of a policy that has moved by `spread`, with a critic that is off."""
 
     def inputs(generator):
-        log_ratio = _off_bounds(spread * _normal(generator, size), clip_range)
-        old_log_probs = base + _normal(generator, size)
-        returns = 3 + 2 * _normal(generator, size)
+        log_ratio = off_bounds(spread * normal(generator, size), clip_range)
+        old_log_probs = base + normal(generator, size)
+        returns = 3 + 2 * normal(generator, size)
         return {
             "log_probs": old_log_probs + log_ratio,
             "old_log_probs": old_log_probs,
-            "advantages": _normal(generator, size) + 0.3,
-            "values": returns + _normal(generator, size) - 0.5,
+            "advantages": normal(generator, size) + 0.3,
+            "values": returns + normal(generator, size) - 0.5,
             "returns": returns,
-            "entropy": 1.5 + 0.3 * _normal(generator, *(() if shared_entropy else (size,))),
+            "entropy": 1.5 + 0.3 * normal(generator, *(() if shared_entropy else (size,))),
             "clip_range": clip_range,
             "vf_coef": vf_coef,
             "ent_coef": ent_coef,
@@ -678,48 +575,28 @@ def _read_off(advantages, entropy, ent_coef, clip_range=0.2, **_rest):
 
 
 def _loss_by_hand(log_probs, old_log_probs, advantages, values, returns, entropy, clip_range, vf_coef, ent_coef):
-    """One sample at a time, in Python's floats: without min, a good action's ratio counts up to the upper bound."""
-    policy = kl = outside = critic = 0.0
-    columns = (log_probs, old_log_probs, advantages, values, returns)
-    for new, old, advantage, value, target in zip(*(column.tolist() for column in columns), strict=True):
-        ratio = math.exp(new - old)
-        policy -= advantage * (min(ratio, 1 + clip_range) if advantage > 0 else max(ratio, 1 - clip_range))
-        kl += ratio - 1 - (new - old)
-        outside += abs(ratio - 1) > clip_range
-        critic += (value - target) ** 2
-    bonus = sum(entropy.reshape(-1).tolist()) / entropy.numel()
-    size = len(log_probs)
-    total = policy / size + vf_coef * critic / size - ent_coef * bonus
+    """In NumPy; the policy's part without min: a good action's ratio counts up to the upper bound."""
+    change, error = (log_probs - old_log_probs).numpy(), (values - returns).numpy()
     metrics = {
-        "policy_loss": policy / size,
-        "value_loss": critic / size,
-        "entropy": bonus,
-        "approx_kl": kl / size,
-        "clip_fraction": outside / size,
+        "policy_loss": clip_by_cases(log_probs, old_log_probs, advantages, clip_range),
+        "value_loss": np.mean(error**2),
+        "entropy": np.mean(entropy.numpy()),
+        "approx_kl": np.mean(np.exp(change) - 1 - change),
+        "clip_fraction": np.mean(np.abs(np.exp(change) - 1) > clip_range),
     }
-    return torch.tensor(total, dtype=torch.float64), {
-        name: torch.tensor(value, dtype=torch.float64) for name, value in metrics.items()
-    }
+    metrics = {name: torch.as_tensor(value) for name, value in metrics.items()}
+    return metrics["policy_loss"] + vf_coef * metrics["value_loss"] - ent_coef * metrics["entropy"], metrics
 
 
 _COLUMNS = ("log_probs", "old_log_probs", "advantages", "values", "returns")
-_LEARNED = ("log_probs", "values", "entropy")
+_CHECKS = (
+    one_shape(*_COLUMNS),
+    satisfies(lambda entropy, log_probs: entropy.ndim == 0 or entropy.shape == log_probs.shape),
+    satisfies(lambda clip_range: clip_range >= 0),
+)
+_DATA = ("old_log_probs", "advantages", "returns")
 
-
-def _refuse_update(columns, entropy, clip_range):
-    first = columns["log_probs"]
-    for name, column in columns.items():
-        if column.shape != first.shape:
-            raise ValueError(f"{name} has shape {tuple(column.shape)}, but log_probs has {tuple(first.shape)}")
-    if entropy.ndim and entropy.shape != first.shape:
-        raise ValueError(f"entropy has shape {tuple(entropy.shape)}, neither () nor that of log_probs, {tuple(first.shape)}")
-    if clip_range < 0:
-        raise ValueError(f"expected clip_range >= 0, but received {clip_range!r}")
-
-
-def _clipped(log_ratio, advantages, clip_range):
-    ratio = log_ratio.exp()
-    return -torch.minimum(ratio * advantages, ratio.clamp(1 - clip_range, 1 + clip_range) * advantages).mean()
+_losses = versions_of(ch45.ppo_loss, *_CHECKS, data=_DATA)
 
 
 def _squared(values, returns):
@@ -739,57 +616,34 @@ def _detached(found, _vf_coef, _ent_coef):
 
 
 def _parts(
-    policy=_clipped,
+    policy=clip,
     critic=_squared,
     bonus=torch.mean,
     kl=_k3,
     outside=_share_outside,
     total=lambda policy, critic, bonus, vf_coef, ent_coef: policy + vf_coef * critic - ent_coef * bonus,
-    log_ratio=lambda new, old: new - old.detach(),
+    log_ratio=lambda new, old: new - old,
     metrics=_detached,
     leaks=(),
-    checked=True,
+    **options,
 ):
     """A version of the loss from its parts; `leaks` names the data that is not detached."""
 
-    def version(log_probs, old_log_probs, advantages, values, returns, entropy, clip_range=0.2, vf_coef=0.5, ent_coef=0.0):
-        if checked:
-            given = (log_probs, old_log_probs, advantages, values, returns)
-            _refuse_update(dict(zip(_COLUMNS, given, strict=True)), entropy, clip_range)
-        weights = advantages if "advantages" in leaks else advantages.detach()
-        targets = returns if "returns" in leaks else returns.detach()
+    def loss(log_probs, old_log_probs, advantages, values, returns, entropy, clip_range, vf_coef, ent_coef):
         change = log_ratio(log_probs, old_log_probs)
-        losses = policy(change, weights, clip_range), critic(values, targets), bonus(entropy)
+        losses = policy(change.exp(), advantages, clip_range), critic(values, returns), bonus(entropy)
         found = dict(zip(("policy_loss", "value_loss", "entropy"), losses, strict=True))
         found |= {"approx_kl": kl(change.detach()), "clip_fraction": outside(change.detach(), clip_range)}
         return total(*losses, vf_coef, ent_coef), metrics(found, vf_coef, ent_coef)
 
-    return version
+    return versions_of(ch45.ppo_loss, *_CHECKS, data=[name for name in _DATA if name not in leaks])(loss, **options)
 
 
-def _plain_ratio(log_ratio, advantages, _clip_range):
-    return -(log_ratio.exp() * advantages).mean()
-
-
-def _maximum(log_ratio, advantages, clip_range):
-    ratio = log_ratio.exp()
-    return -torch.maximum(ratio * advantages, ratio.clamp(1 - clip_range, 1 + clip_range) * advantages).mean()
-
-
-def _only_clipped(log_ratio, advantages, clip_range):
-    return -(log_ratio.exp().clamp(1 - clip_range, 1 + clip_range) * advantages).mean()
-
-
-def _normalised_first(log_ratio, advantages, clip_range):
-    return _clipped(log_ratio, (advantages - advantages.mean()) / (advantages.std() + 1e-8), clip_range)
-
-
-def _one_by_one(log_probs, old_log_probs, advantages, values, returns, entropy, clip_range=0.2, vf_coef=0.5, ent_coef=0.0):
+@_losses
+def _one_by_one(log_probs, old_log_probs, advantages, values, returns, entropy, clip_range, vf_coef, ent_coef):
     """A variant: a loop over samples that keeps the graph."""
-    columns = (log_probs, old_log_probs.detach(), advantages.detach(), values, returns.detach())
-    _refuse_update(dict(zip(_COLUMNS, columns, strict=True)), entropy, clip_range)
     policy, critic, kl, outside = [], [], [], []
-    for new, old, advantage, value, target in zip(*columns, strict=True):
+    for new, old, advantage, value, target in zip(log_probs, old_log_probs, advantages, values, returns, strict=True):
         ratio = torch.exp(new - old)
         free = ratio <= 1 + clip_range if advantage > 0 else ratio >= 1 - clip_range
         bound = 1 + clip_range if advantage > 0 else 1 - clip_range
@@ -804,14 +658,9 @@ def _one_by_one(log_probs, old_log_probs, advantages, values, returns, entropy, 
     return loss, {name: value.clone().detach() for name, value in found.items()}
 
 
-def _by_torch_functions(
-    log_probs, old_log_probs, advantages, values, returns, entropy, clip_range=0.2, vf_coef=0.5, ent_coef=0.0
-):
+@_losses
+def _by_torch_functions(log_probs, old_log_probs, advantages, values, returns, entropy, clip_range, vf_coef, ent_coef):
     """A variant in the style of Stable-Baselines3."""
-    columns = (log_probs, old_log_probs, advantages, values, returns)
-    _refuse_update(dict(zip(_COLUMNS, columns, strict=True)), entropy, clip_range)
-    with torch.no_grad():
-        old_log_probs, advantages, returns = old_log_probs.clone(), advantages.clone(), returns.clone()
     ratio = torch.exp(log_probs - old_log_probs)
     first, second = advantages * ratio, advantages * torch.clamp(ratio, 1 - clip_range, 1 + clip_range)
     policy_loss = -torch.min(first, second).mean()
@@ -829,21 +678,118 @@ def _by_torch_functions(
     return policy_loss + ent_coef * entropy_loss + vf_coef * value_loss, metrics
 
 
-def _mask_of_the_saturated(log_ratio, advantages, clip_range):
-    ratio = log_ratio.exp()
-    saturated = ((advantages > 0) & (ratio > 1 + clip_range)) | ((advantages < 0) & (ratio < 1 - clip_range))
-    return (torch.where(saturated, ratio.detach().clamp(1 - clip_range, 1 + clip_range), ratio) * -advantages).mean()
-
-
-def _excess_past_the_bound(log_ratio, advantages, clip_range):
-    ratio = log_ratio.exp()
-    past = torch.where(advantages > 0, (ratio - 1 - clip_range).relu(), (1 - clip_range - ratio).relu())
-    return (advantages.abs() * past - advantages * ratio).mean()
-
-
-def _reshaped(name, change, **options):
-    return _changed(_update(**options), **{name: change})
-
+_WRONG_PPO_LOSS = {
+    "policy-sign-missing": (
+        _parts(policy=lambda *given: -clip(*given)),
+        "The policy's objective is to be maximised, a loss minimised: negate it.",
+    ),
+    "not-clipped": (_parts(policy=plain), "Nothing is clipped: the loss takes the smaller of ρ A and clip(ρ) A."),
+    "max-instead-of-min": (
+        _parts(policy=lambda r, a, e: -torch.maximum(r * a, r.clamp(1 - e, 1 + e) * a).mean()),
+        "Take the smaller of the two products (the larger only once both are negated): max caps just the wrong side.",
+    ),
+    "only-the-clipped-term": (
+        _parts(policy=lambda r, a, e: -(r.clamp(1 - e, 1 + e) * a).mean()),
+        "The minimum is missing: clipped on both sides, an action that went the wrong way is never pulled back.",
+    ),
+    "ratio-inverted": (
+        _parts(log_ratio=lambda new, old: old - new),
+        "The ratio is old over new: it is exp(log_probs - old_log_probs), new minus old.",
+    ),
+    "advantages-normalised-inside": (
+        _parts(policy=lambda r, a, e: clip(r, normalised(a), e)),
+        "The loss takes the advantages as they come: normalising is the caller's choice.",
+    ),
+    "clip-range-ignored": (
+        _parts(policy=lambda r, a, e: clip(r, a, 0.2), outside=lambda d, e: _share_outside(d, 0.2)),
+        "The range is 0.2 whatever the caller says: use clip_range.",
+    ),
+    "value-loss-halved": (
+        _parts(critic=lambda v, r: 0.5 * _squared(v, r)),
+        "There is no half in this value loss: vf_coef is its only factor.",
+    ),
+    "value-loss-summed": (
+        _parts(critic=lambda v, r: _squared(v, r) * v.numel()),
+        "A sum grows with the minibatch: take the mean of the squared errors.",
+    ),
+    "value-error-not-squared": (
+        _parts(critic=lambda v, r: (v - r).abs().mean()),
+        "This is the mean absolute error, which fits the median of the returns; the value is their mean: square.",
+    ),
+    "value-error-capped": (
+        _parts(critic=torch.nn.functional.smooth_l1_loss),
+        "This is the Huber loss: large errors count less than their square.",
+    ),
+    "values-detached": (
+        _parts(critic=lambda v, r: _squared(v.detach(), r)),
+        "No gradient reaches the values: the critic would never learn.",
+    ),
+    "entropy-sign-wrong": (
+        _parts(total=lambda policy, critic, bonus, vf, ent: policy + vf * critic + ent * bonus),
+        "Adding the entropy to a loss makes the policy narrow as fast as it can: a bonus is subtracted.",
+    ),
+    "entropy-left-out": (
+        _parts(total=lambda policy, critic, bonus, vf, ent: policy + vf * critic),
+        "The entropy bonus is reported but not part of the loss.",
+    ),
+    "coefficients-swapped": (
+        _parts(total=lambda policy, critic, bonus, vf, ent: policy + ent * critic - vf * bonus),
+        "vf_coef weighs the value loss and ent_coef the entropy; here it is the other way round.",
+    ),
+    "value-coefficient-ignored": (
+        _parts(total=lambda policy, critic, bonus, vf, ent: policy + critic - ent * bonus),
+        "The value loss counts in full, whatever vf_coef says.",
+    ),
+    "metrics-weighted": (
+        _parts(
+            metrics=lambda found, vf, ent: {
+                name: value.detach() * {"value_loss": vf, "entropy": ent}.get(name, 1) for name, value in found.items()
+            }
+        ),
+        "value_loss and entropy are reported as they are, without their coefficients: so that runs with different ones compare.",
+    ),
+    "k1-instead-of-k3": (
+        _parts(kl=lambda d: -d.mean()),
+        "approx_kl is mean(ρ - 1 - log ρ): the plain mean of -log ρ is as right on average, but noisy, and it can be negative.",
+    ),
+    "kl-of-swapped-policies": (
+        _parts(kl=lambda d: _k3(-d)),
+        "approx_kl has the ratio the wrong way round: the actions come from the old policy, so ρ is new over old.",
+    ),
+    "clip-fraction-on-one-side": (
+        _parts(outside=lambda d, e: (d.expm1() > e).to(d.dtype).mean()),
+        "clip_fraction counts ratios above 1 + ε only: those below 1 - ε have left the interval as well.",
+    ),
+    "clip-fraction-of-logarithms": (
+        _parts(outside=lambda d, e: (d.abs() > e).to(d.dtype).mean()),
+        "clip_fraction compares |log ρ| with ε; it is about |ρ - 1|.",
+    ),
+    "metrics-carry-a-graph": (
+        _parts(metrics=lambda found, vf, ent: found),
+        "A reported metric carries no graph: detach it, or every log entry keeps a network's activations alive.",
+    ),
+    "metrics-as-python-floats": (
+        _parts(metrics=lambda found, vf, ent: {name: value.item() for name, value in found.items()}),
+        "The metrics are 0-dim tensors: .item() in each minibatch makes a device wait; convert once, when you log.",
+    ),
+    "gradient-into-old-log-probs": (
+        _parts(leaks=("old_log_probs",)),
+        "The old log-probabilities are data of the rollout: detach them.",
+    ),
+    "gradient-into-advantages": (
+        _parts(leaks=("advantages",)),
+        "The policy's loss must not train the critic: detach the advantages.",
+    ),
+    "gradient-into-returns": (_parts(leaks=("returns",)), "The target must not run towards the value: detach the returns."),
+    "nothing-detached": (
+        _parts(leaks=_DATA),
+        "Gradient reaches old_log_probs, advantages and returns: all three are data of the rollout, detach them.",
+    ),
+    "dtype-lost": (
+        after(ch45.ppo_loss, lambda found: (found[0].float(), {name: value.float() for name, value in found[1].items()})),
+        DTYPE,
+    ),
+}
 
 PPO_LOSS = Exercise(
     name="ppo_loss",
@@ -868,171 +814,19 @@ PPO_LOSS = Exercise(
             differentiate=(*_COLUMNS, "entropy"),
         ),
         _case("single precision", _update(), dtype=torch.float32, visible=True),
-        _case(
-            "entropy of one sample",
-            _reshaped("entropy", lambda h: h[:1]),
-            raises=("entropy",),
-        ),
-        _case("values as a column", _reshaped("values", lambda v: v[:, None]), raises=_COLUMNS, visible=True),
-        _case("returns of one sample", _reshaped("returns", lambda r: r[:1]), raises=_COLUMNS),
-        _case("advantages as a column", _reshaped("advantages", lambda a: a[:, None]), raises=_COLUMNS),
-        _case("old_log_probs of one sample", _reshaped("old_log_probs", lambda o: o[:1]), raises=_COLUMNS),
-        _case("clip_range = -0.1", _with(_update(), clip_range=-0.1), raises=("clip_range",), visible=True),
+        _case("entropy of one sample", reshaped(_update(), "entropy", lambda h: h[:1]), raises=("entropy",)),
+        _case("values as a column", reshaped(_update(), "values", lambda v: v[:, None]), raises=_COLUMNS, visible=True),
+        _case("returns of one sample", reshaped(_update(), "returns", lambda r: r[:1]), raises=_COLUMNS),
+        _case("advantages as a column", reshaped(_update(), "advantages", lambda a: a[:, None]), raises=_COLUMNS),
+        _case("old_log_probs of one sample", reshaped(_update(), "old_log_probs", lambda o: o[:1]), raises=_COLUMNS),
+        _case("clip_range = -0.1", replaced(_update(), clip_range=-0.1), raises=("clip_range",), visible=True),
     ),
-    misconceptions=(
-        Misconception(
-            "policy-sign-missing",
-            _parts(policy=lambda *given: -_clipped(*given)),
-            "The policy's objective is to be maximised, a loss minimised: negate it.",
-        ),
-        Misconception(
-            "not-clipped",
-            _parts(policy=_plain_ratio),
-            "Nothing is clipped: the loss takes the smaller of ρ A and clip(ρ) A.",
-        ),
-        Misconception(
-            "max-instead-of-min",
-            _parts(policy=_maximum),
-            "Take the smaller of the two products (the larger only once both are negated): max caps just the wrong side.",
-        ),
-        Misconception(
-            "only-the-clipped-term",
-            _parts(policy=_only_clipped),
-            "The minimum is missing: clipped on both sides, an action that went the wrong way is never pulled back.",
-        ),
-        Misconception(
-            "ratio-inverted",
-            _parts(log_ratio=lambda new, old: old.detach() - new),
-            "The ratio is old over new: it is exp(log_probs - old_log_probs), new minus old.",
-        ),
-        Misconception(
-            "advantages-normalised-inside",
-            _parts(policy=_normalised_first),
-            "The loss takes the advantages as they come: normalising is the caller's choice.",
-        ),
-        Misconception(
-            "clip-range-ignored",
-            _parts(policy=lambda d, a, e: _clipped(d, a, 0.2), outside=lambda d, e: _share_outside(d, 0.2)),
-            "The range is 0.2 whatever the caller says: use clip_range.",
-        ),
-        Misconception(
-            "value-loss-halved",
-            _parts(critic=lambda v, r: 0.5 * _squared(v, r)),
-            "There is no half in this value loss: vf_coef is its only factor.",
-        ),
-        Misconception(
-            "value-loss-summed",
-            _parts(critic=lambda v, r: _squared(v, r) * v.numel()),
-            "A sum grows with the minibatch: take the mean of the squared errors.",
-        ),
-        Misconception(
-            "value-error-not-squared",
-            _parts(critic=lambda v, r: (v - r).abs().mean()),
-            "This is the mean absolute error, which fits the median of the returns; the value is their mean: square.",
-        ),
-        Misconception(
-            "value-error-capped",
-            _parts(critic=lambda v, r: torch.nn.functional.smooth_l1_loss(v, r)),
-            "This is the Huber loss: large errors count less than their square.",
-        ),
-        Misconception(
-            "values-detached",
-            _parts(critic=lambda v, r: _squared(v.detach(), r)),
-            "No gradient reaches the values: the critic would never learn.",
-        ),
-        Misconception(
-            "entropy-sign-wrong",
-            _parts(total=lambda policy, critic, bonus, vf, ent: policy + vf * critic + ent * bonus),
-            "Adding the entropy to a loss makes the policy narrow as fast as it can: a bonus is subtracted.",
-        ),
-        Misconception(
-            "entropy-left-out",
-            _parts(total=lambda policy, critic, bonus, vf, ent: policy + vf * critic),
-            "The entropy bonus is reported but not part of the loss.",
-        ),
-        Misconception(
-            "coefficients-swapped",
-            _parts(total=lambda policy, critic, bonus, vf, ent: policy + ent * critic - vf * bonus),
-            "vf_coef weighs the value loss and ent_coef the entropy; here it is the other way round.",
-        ),
-        Misconception(
-            "value-coefficient-ignored",
-            _parts(total=lambda policy, critic, bonus, vf, ent: policy + critic - ent * bonus),
-            "The value loss counts in full, whatever vf_coef says.",
-        ),
-        Misconception(
-            "metrics-weighted",
-            _parts(
-                metrics=lambda found, vf, ent: {
-                    name: value.detach() * {"value_loss": vf, "entropy": ent}.get(name, 1) for name, value in found.items()
-                }
-            ),
-            "value_loss and entropy are reported as they are, without their coefficients: so that runs with different ones compare.",
-        ),
-        Misconception(
-            "k1-instead-of-k3",
-            _parts(kl=lambda d: -d.mean()),
-            "approx_kl is mean(ρ - 1 - log ρ): the plain mean of -log ρ is as right on average, but noisy, and it can be negative.",
-        ),
-        Misconception(
-            "kl-of-swapped-policies",
-            _parts(kl=lambda d: _k3(-d)),
-            "approx_kl has the ratio the wrong way round: the actions come from the old policy, so ρ is new over old.",
-        ),
-        Misconception(
-            "clip-fraction-on-one-side",
-            _parts(outside=lambda d, e: (d.expm1() > e).to(d.dtype).mean()),
-            "clip_fraction counts ratios above 1 + ε only: those below 1 - ε have left the interval as well.",
-        ),
-        Misconception(
-            "clip-fraction-of-logarithms",
-            _parts(outside=lambda d, e: (d.abs() > e).to(d.dtype).mean()),
-            "clip_fraction compares |log ρ| with ε; it is about |ρ - 1|.",
-        ),
-        Misconception(
-            "metrics-carry-a-graph",
-            _parts(metrics=lambda found, vf, ent: found),
-            "A reported metric carries no graph: detach it, or every log entry keeps a network's activations alive.",
-        ),
-        Misconception(
-            "metrics-as-python-floats",
-            _parts(metrics=lambda found, vf, ent: {name: value.item() for name, value in found.items()}),
-            "The metrics are 0-dim tensors: .item() in each minibatch makes a device wait; convert once, when you log.",
-        ),
-        Misconception(
-            "gradient-into-old-log-probs",
-            _parts(log_ratio=lambda new, old: new - old),
-            "The old log-probabilities are data of the rollout: detach them.",
-        ),
-        Misconception(
-            "gradient-into-advantages",
-            _parts(leaks=("advantages",)),
-            "The policy's loss must not train the critic: detach the advantages.",
-        ),
-        Misconception(
-            "gradient-into-returns",
-            _parts(leaks=("returns",)),
-            "The target must not run towards the value: detach the returns.",
-        ),
-        Misconception(
-            "nothing-detached",
-            _parts(log_ratio=lambda new, old: new - old, leaks=("advantages", "returns")),
-            "Gradient reaches old_log_probs, advantages and returns: all three are data of the rollout, detach them.",
-        ),
-        Misconception(
-            "dtype-lost",
-            _after(ch45.ppo_loss, lambda found: (found[0].float(), {name: value.float() for name, value in found[1].items()})),
-            _DTYPE,
-        ),
-        Misconception("bad-input-accepted", _parts(checked=False), _VALIDATE),
-    ),
+    misconceptions=(*wrong(_WRONG_PPO_LOSS), bad_input_accepted(_parts(checked=False))),
     variants={
         "torch's loss functions": _by_torch_functions,
         "one sample at a time": _one_by_one,
-        "mask of the saturated": _parts(policy=_mask_of_the_saturated),
-        "excess past the bound, dot product": _parts(
-            policy=_excess_past_the_bound, critic=lambda v, r: (v - r) @ (v - r) / len(v)
-        ),
+        "mask of the saturated": _parts(policy=clip_by_mask),
+        "excess past the bound, dot product": _parts(policy=clip_by_excess, critic=lambda v, r: (v - r) @ (v - r) / len(v)),
         "the sum of one loss for each sample": _parts(
             total=lambda policy, critic, bonus, vf, ent: torch.stack([policy, vf * critic, -ent * bonus]).sum()
         ),
@@ -1053,7 +847,7 @@ def _collecting(maker, num_steps, log_std=0.5, steps=0, action=0.0, **options):
     """A rollout of `num_steps` steps with a wide policy; `steps` have been made before."""
 
     def inputs(generator):
-        seeds = torch.randint(2**31, (3,), generator=generator).tolist()
+        seeds = integers(generator, 0, 2**31, 3).tolist()
         envs, obs = _vector_env(maker, seeds[0], steps, action, **options)
         shape = {"obs_dim": obs.shape[1], "action_dim": 1, "hidden": 4}
         return {
@@ -1145,120 +939,6 @@ def _own_generator(policy, obs, _generator):
     return policy.act(obs, torch.Generator().manual_seed(0))
 
 
-_ENDS = "`terminated` and `truncated` are two facts, and one of them decides about the bootstrap: record both as they come."
-_COLLECT_MISTAKES = (
-    Misconception(
-        "next-obs-after-reset",
-        _rollout(successors=lambda obs, info, before: obs),
-        "Where an episode ends, next_obs shows the first observation of the next one: the true last observation is in "
-        'info["final_obs"], and course_lib.control.rollouts.true_next_obs puts it in its place.',
-    ),
-    Misconception(
-        "next-obs-is-obs",
-        _rollout(successors=lambda obs, info, before: before),
-        "next_obs repeats obs: it is what the step has led to.",
-    ),
-    Misconception(
-        "obs-after-the-step",
-        _recording(obs=lambda row: row["after"]),
-        "obs shows the state after the action: record what the policy saw when it chose.",
-    ),
-    Misconception("truncated-as-terminated", _recording(terminated=_either_end), _ENDS),
-    Misconception("terminated-as-truncated", _recording(truncated=_either_end), _ENDS),
-    Misconception(
-        "ends-swapped", _recording(terminated=lambda row: row["truncated"], truncated=lambda row: row["terminated"]), _ENDS
-    ),
-    Misconception(
-        "clipped-actions-recorded",
-        _recording(actions=lambda row: row["executed"]),
-        "The actions are recorded as clipped. Their log-probability is then that of another action: record them as sampled.",
-    ),
-    Misconception(
-        "rewards-clipped",
-        _recording(rewards=lambda row: row["rewards"].clamp(-1, 1)),
-        "The rewards are clipped to [-1, 1]: the actions are what has bounds. Record rewards as they come.",
-    ),
-    Misconception(
-        "mean-action",
-        _rollout(act=lambda policy, obs, generator: policy.best_action(obs)),
-        "The actions are the likeliest ones, not samples: without exploration every action is as good as expected.",
-    ),
-    Misconception(
-        "own-generator",
-        _rollout(act=_own_generator),
-        "The actions are drawn from a generator made anew: the same noise at every step. Use the one that is given.",
-    ),
-    Misconception(
-        "restarted",
-        _rollout(begin=_restarted),
-        "The environments are reset at the beginning. A rollout goes on where the last one stopped: start from obs.",
-    ),
-    Misconception(
-        "last-obs-before-reset",
-        _rollout(last=lambda obs, row: row["next_obs"]),
-        "last_obs is the true successor of the last step; where an episode has just ended the environments show the next one's start.",
-    ),
-    Misconception(
-        "one-step-too-many",
-        _rollout(extra_steps=1),
-        "There is a step too many: a rollout has num_steps rows.",
-    ),
-    Misconception(
-        "axes-swapped",
-        _rollout(finish=_columnwise(lambda column: column.transpose(0, 1))),
-        "Rollouts are time-major: (T, N), not (N, T).",
-    ),
-    Misconception(
-        "flattened",
-        _rollout(finish=_columnwise(lambda column: column.flatten(0, 1))),
-        "The rows of all environments are in one axis; GAE needs (T, N).",
-    ),
-)
-
-COLLECT_ROLLOUT = Exercise(
-    name="collect_rollout",
-    reference=ch45.collect_rollout,
-    criteria={"values": 1.9, "inputs": 0.1},
-    axes=("t", "env"),
-    cases=(
-        _case(
-            "episodes of 3, 5 and 2 steps",
-            _collecting("TimerVectorEnv", 7, log_std=1.0, steps=1, **_PAYING),
-            visible=True,
-            draws=1,
-        ),
-        _case("an end at the last step", _collecting("TimerVectorEnv", 6, **_PAYING), visible=True),
-        _case("bounds of -0.3 and 0.8", _collecting("TimerVectorEnv", 5, low=-0.3, high=0.8, **_PAYING), visible=True),
-        _case("drones with a time limit", _collecting("HoverVectorEnv", 8, num_envs=4, time_limit=5), visible=True),
-        _case("drones that fly away", _collecting("HoverVectorEnv", 12, steps=6, action=1.0, num_envs=3)),
-    ),
-    misconceptions=(
-        *_COLLECT_MISTAKES,
-        Misconception(
-            "actions-not-clipped",
-            _rollout(executed=lambda envs, actions: actions.numpy()),
-            "The environment gets actions beyond its bounds. Clip what is executed, and record what was sampled.",
-        ),
-        Misconception(
-            "bounds-guessed",
-            _rollout(executed=lambda envs, actions: actions.numpy().clip(-1, 1)),
-            "-1 and 1 are the bounds of many action spaces, not of all: envs.single_action_space has low and high.",
-        ),
-    ),
-    variants={
-        "memory made beforehand": lambda *given: _into_memory(*given),
-        "columns of arrays": lambda *given: _columns_of_arrays(*given),
-        "successors put in by where": _rollout(
-            successors=lambda obs, info, before: np.where(
-                np.asarray(info.get("_final_obs", np.zeros(len(obs), bool)))[:, None], info.get("final_obs", obs), obs
-            )
-        ),
-        "clipped by torch": _rollout(executed=_clamped),
-        "a dict": _rollout(finish=lambda rollout: Rollout(**{name: column.clone() for name, column in vars(rollout).items()})),
-    },
-)
-
-
 def _into_memory(envs, policy, num_steps, obs, generator):
     """A variant: tensors made once, filled row by row."""
     shape, obs = (num_steps, envs.num_envs), np.array(obs)
@@ -1295,6 +975,99 @@ def _columns_of_arrays(envs, policy, num_steps, obs, generator):
     return Rollout(**tensors, last_obs=torch.from_numpy(np.array(obs, np.float32)))
 
 
+_ENDS = "`terminated` and `truncated` are two facts, and one of them decides about the bootstrap: record both as they come."
+_WRONG_ROLLOUTS = {
+    "next-obs-after-reset": (
+        _rollout(successors=lambda obs, info, before: obs),
+        "Where an episode ends, next_obs shows the first observation of the next one: the true last observation is in "
+        'info["final_obs"], and course_lib.control.rollouts.true_next_obs puts it in its place.',
+    ),
+    "next-obs-is-obs": (
+        _rollout(successors=lambda obs, info, before: before),
+        "next_obs repeats obs: it is what the step has led to.",
+    ),
+    "obs-after-the-step": (
+        _recording(obs=lambda row: row["after"]),
+        "obs shows the state after the action: record what the policy saw when it chose.",
+    ),
+    "truncated-as-terminated": (_recording(terminated=_either_end), _ENDS),
+    "terminated-as-truncated": (_recording(truncated=_either_end), _ENDS),
+    "ends-swapped": (_recording(terminated=lambda row: row["truncated"], truncated=lambda row: row["terminated"]), _ENDS),
+    "clipped-actions-recorded": (
+        _recording(actions=lambda row: row["executed"]),
+        "The actions are recorded as clipped. Their log-probability is then that of another action: record them as sampled.",
+    ),
+    "rewards-clipped": (
+        _recording(rewards=lambda row: row["rewards"].clamp(-1, 1)),
+        "The rewards are clipped to [-1, 1]: the actions are what has bounds. Record rewards as they come.",
+    ),
+    "mean-action": (
+        _rollout(act=lambda policy, obs, generator: policy.best_action(obs)),
+        "The actions are the likeliest ones, not samples: without exploration every action is as good as expected.",
+    ),
+    "own-generator": (
+        _rollout(act=_own_generator),
+        "The actions are drawn from a generator made anew: the same noise at every step. Use the one that is given.",
+    ),
+    "restarted": (
+        _rollout(begin=_restarted),
+        "The environments are reset at the beginning. A rollout goes on where the last one stopped: start from obs.",
+    ),
+    "last-obs-before-reset": (
+        _rollout(last=lambda obs, row: row["next_obs"]),
+        "last_obs is the true successor of the last step; where an episode has just ended the environments show the next one's start.",
+    ),
+    "one-step-too-many": (_rollout(extra_steps=1), "There is a step too many: a rollout has num_steps rows."),
+    "axes-swapped": (
+        _rollout(finish=_columnwise(lambda column: column.transpose(0, 1))),
+        "Rollouts are time-major: (T, N), not (N, T).",
+    ),
+    "flattened": (
+        _rollout(finish=_columnwise(lambda column: column.flatten(0, 1))),
+        "The rows of all environments are in one axis; GAE needs (T, N).",
+    ),
+    "actions-not-clipped": (
+        _rollout(executed=lambda envs, actions: actions.numpy()),
+        "The environment gets actions beyond its bounds. Clip what is executed, and record what was sampled.",
+    ),
+    "bounds-guessed": (
+        _rollout(executed=lambda envs, actions: actions.numpy().clip(-1, 1)),
+        "-1 and 1 are the bounds of many action spaces, not of all: envs.single_action_space has low and high.",
+    ),
+}
+
+COLLECT_ROLLOUT = Exercise(
+    name="collect_rollout",
+    reference=ch45.collect_rollout,
+    criteria={"values": 1.9, "inputs": 0.1},
+    axes=("t", "env"),
+    cases=(
+        _case(
+            "episodes of 3, 5 and 2 steps",
+            _collecting("TimerVectorEnv", 7, log_std=1.0, steps=1, **_PAYING),
+            visible=True,
+            draws=1,
+        ),
+        _case("an end at the last step", _collecting("TimerVectorEnv", 6, **_PAYING), visible=True),
+        _case("bounds of -0.3 and 0.8", _collecting("TimerVectorEnv", 5, low=-0.3, high=0.8, **_PAYING), visible=True),
+        _case("drones with a time limit", _collecting("HoverVectorEnv", 8, num_envs=4, time_limit=5), visible=True),
+        _case("drones that fly away", _collecting("HoverVectorEnv", 12, steps=6, action=1.0, num_envs=3)),
+    ),
+    misconceptions=wrong(_WRONG_ROLLOUTS),
+    variants={
+        "memory made beforehand": _into_memory,
+        "columns of arrays": _columns_of_arrays,
+        "successors put in by where": _rollout(
+            successors=lambda obs, info, before: np.where(
+                np.asarray(info.get("_final_obs", np.zeros(len(obs), bool)))[:, None], info.get("final_obs", obs), obs
+            )
+        ),
+        "clipped by torch": _rollout(executed=_clamped),
+        "a dict": _rollout(finish=lambda rollout: Rollout(**{name: column.clone() for name, column in vars(rollout).items()})),
+    },
+)
+
+
 # ------------------------------------------------------------------------------------------------------------ ppo_update
 
 
@@ -1302,10 +1075,10 @@ def _updated(size=16, minibatch_size=64, learning_rate=0.01, **settings):
     """A small policy, and a batch that another has collected. One minibatch for all, so that the order makes no difference."""
 
     def inputs(generator):
-        seeds = torch.randint(2**31, (2,), generator=generator).tolist()
+        seeds = integers(generator, 0, 2**31, 2).tolist()
 
         def drawn(*shape):
-            return _normal(generator, *shape).float().numpy()
+            return normal(generator, *shape).float().numpy()
 
         actions = np.float32(0.6) * drawn(size, 2)
         mean, log_std = torch.zeros(size, 2), torch.full((2,), -0.5)
@@ -1357,13 +1130,29 @@ def _averaged(history):
     return {name: torch.stack([metrics[name] for metrics in history]).mean() for name in history[0]}
 
 
+def _afresh(policy, loss):
+    policy.weights.grad = None
+    loss.backward()
+
+
+def _by_autograd(policy, loss):
+    """A variant: the gradient is asked for, not left behind."""
+    (policy.weights.grad,) = torch.autograd.grad(loss, policy.weights)
+
+
+def _from_zero(policy, loss):
+    if policy.weights.grad is not None:
+        policy.weights.grad.zero_()
+    loss.backward()
+
+
 def _updating(
     epochs=lambda settings: settings.num_epochs,
     parts=_minibatches_of,
     old=lambda rows, log_probs: rows.old_log_probs,
     weights=lambda rows: rows.advantages,
     coefficients=_coefficients,
-    clear=lambda policy: setattr(policy.weights, "grad", None),
+    differentiate=_afresh,
     longest=lambda settings: settings.max_grad_norm,
     stop_at="epoch",
     summary=_averaged,
@@ -1380,8 +1169,7 @@ def _updating(
                 before = old(rows, log_probs)
                 given = (log_probs, before, weights(rows), values, rows.returns, entropy, *coefficients(settings))
                 loss, metrics = ch45.ppo_loss(*given)
-                clear(policy)
-                loss.backward()
+                differentiate(policy, loss)
                 optimizer.step(policy, longest(settings))
                 history.append(metrics)
                 divergences.append(metrics["approx_kl"].item())
@@ -1392,10 +1180,6 @@ def _updating(
         return summary(history)
 
     return version
-
-
-def _normalised_rows(rows):
-    return (rows.advantages - rows.advantages.mean()) / (rows.advantages.std() + 1e-8)
 
 
 def _running_sums(policy, optimizer, batch, settings, generator):
@@ -1419,26 +1203,64 @@ def _running_sums(policy, optimizer, batch, settings, generator):
     return {name: total / count for name, total in sums.items()}
 
 
-def _by_autograd(policy, optimizer, batch, settings, generator):
-    """A variant: the gradient is asked for, not left behind."""
-    history = []
-    for _ in range(settings.num_epochs):
-        epoch = []
-        for rows in _minibatches_of(batch, settings, generator):
-            log_probs, entropy, values = ch45.evaluate_actions(policy, rows.obs, rows.actions)
-            given = (log_probs, rows.old_log_probs, rows.advantages, values, rows.returns, entropy)
-            loss, metrics = ch45.ppo_loss(*given, *_coefficients(settings))
-            (policy.weights.grad,) = torch.autograd.grad(loss, policy.weights)
-            optimizer.step(policy, settings.max_grad_norm)
-            epoch.append(metrics)
-        history.extend(epoch)
-        if np.mean([float(metrics["approx_kl"]) for metrics in epoch]) > settings.target_kl:
-            break
-    return _averaged(history)
-
-
 _AFTERWARDS = ("policy", "optimizer")
 _STEPS = {"returns": ("optimizer",), "view": "steps_made"}
+
+_WRONG_PPO_UPDATE = {
+    "gradient-never-cleared": (
+        _updating(differentiate=lambda policy, loss: loss.backward()),
+        "backward() adds to the gradient that is there: set policy.weights.grad to None before it.",
+    ),
+    "gradient-not-clipped": (
+        _updating(longest=lambda settings: INF),
+        "The gradient's norm is not clipped: hand settings.max_grad_norm to optimizer.step.",
+    ),
+    "one-epoch-only": (_updating(epochs=lambda settings: 1), "The batch is used once: settings.num_epochs says how often."),
+    "whole-batch-at-once": (
+        _updating(parts=lambda batch, settings, generator: [batch]),
+        "There is one step in each epoch: make one for each minibatch.",
+    ),
+    "first-minibatch-only": (
+        _updating(parts=lambda *given: _minibatches_of(*given)[:1]),
+        "Each epoch ends after its first minibatch: a return or break is one level too deep.",
+    ),
+    "old-log-probs-recomputed": (
+        _updating(old=lambda rows, log_probs: log_probs.detach()),
+        "The old log-probabilities are those of the policy that acted, batch.old_log_probs, in every epoch.",
+    ),
+    "advantages-normalised-again": (
+        _updating(weights=lambda rows: normalised(rows.advantages)),
+        "The advantages are normalised here, although they are to be taken as given: whoever made the batch has decided.",
+    ),
+    "clip-range-fixed": (
+        _updating(coefficients=lambda settings: (0.2, settings.vf_coef, settings.ent_coef)),
+        "The clip range is 0.2 whatever the settings say.",
+    ),
+    "coefficients-swapped": (
+        _updating(coefficients=lambda settings: (settings.clip_range, settings.ent_coef, settings.vf_coef)),
+        "vf_coef and ent_coef are the wrong way round in the call of ppo_loss.",
+    ),
+    "target-kl-ignored": (
+        _updating(stop_at="never"),
+        "The update goes on although the KL divergence has passed settings.target_kl: stop after that epoch.",
+    ),
+    "stops-in-the-midst": (
+        _updating(stop_at="minibatch"),
+        "The update stops in the midst of an epoch: a single minibatch's KL is noisy, compare the epoch's mean.",
+    ),
+    "metrics-of-the-last-minibatch": (
+        _updating(summary=lambda history: history[-1]),
+        "The metrics are those of the last minibatch: average over all.",
+    ),
+    "metrics-summed": (
+        _updating(summary=lambda history: {name: metric * len(history) for name, metric in _averaged(history).items()}),
+        "The metrics are added up: they then depend on the number of minibatches. Average.",
+    ),
+    "copy-trained": (
+        _updating(trained=copy.deepcopy),
+        "The policy that was handed in has not changed: a copy was trained. Change policy itself, in place.",
+    ),
+}
 
 PPO_UPDATE = Exercise(
     name="ppo_update",
@@ -1460,87 +1282,14 @@ PPO_UPDATE = Exercise(
         _case("steps, where the mean stays just below target_kl", _near_the_mean(1.02), **_STEPS, draws=4),
         _case("steps, where the mean is just above target_kl", _near_the_mean(0.97), **_STEPS, draws=4),
     ),
-    misconceptions=(
-        Misconception(
-            "gradient-never-cleared",
-            _updating(clear=lambda policy: None),
-            "backward() adds to the gradient that is there: set policy.weights.grad to None before it.",
-        ),
-        Misconception(
-            "gradient-not-clipped",
-            _updating(longest=lambda settings: INF),
-            "The gradient's norm is not clipped: hand settings.max_grad_norm to optimizer.step.",
-        ),
-        Misconception(
-            "one-epoch-only",
-            _updating(epochs=lambda settings: 1),
-            "The batch is used once: settings.num_epochs says how often.",
-        ),
-        Misconception(
-            "whole-batch-at-once",
-            _updating(parts=lambda batch, settings, generator: [batch]),
-            "There is one step in each epoch: make one for each minibatch.",
-        ),
-        Misconception(
-            "first-minibatch-only",
-            _updating(parts=lambda *given: _minibatches_of(*given)[:1]),
-            "Each epoch ends after its first minibatch: a return or break is one level too deep.",
-        ),
-        Misconception(
-            "old-log-probs-recomputed",
-            _updating(old=lambda rows, log_probs: log_probs.detach()),
-            "The old log-probabilities are those of the policy that acted, batch.old_log_probs, in every epoch.",
-        ),
-        Misconception(
-            "advantages-normalised-again",
-            _updating(weights=_normalised_rows),
-            "The advantages are normalised here, although they are to be taken as given: whoever made the batch has decided.",
-        ),
-        Misconception(
-            "clip-range-fixed",
-            _updating(coefficients=lambda settings: (0.2, settings.vf_coef, settings.ent_coef)),
-            "The clip range is 0.2 whatever the settings say.",
-        ),
-        Misconception(
-            "coefficients-swapped",
-            _updating(coefficients=lambda settings: (settings.clip_range, settings.ent_coef, settings.vf_coef)),
-            "vf_coef and ent_coef are the wrong way round in the call of ppo_loss.",
-        ),
-        Misconception(
-            "target-kl-ignored",
-            _updating(stop_at="never"),
-            "The update goes on although the KL divergence has passed settings.target_kl: stop after that epoch.",
-        ),
-        Misconception(
-            "stops-in-the-midst",
-            _updating(stop_at="minibatch"),
-            "The update stops in the midst of an epoch: a single minibatch's KL is noisy, compare the epoch's mean.",
-        ),
-        Misconception(
-            "metrics-of-the-last-minibatch",
-            _updating(summary=lambda history: history[-1]),
-            "The metrics are those of the last minibatch: average over all.",
-        ),
-        Misconception(
-            "metrics-summed",
-            _updating(summary=lambda history: {name: metric * len(history) for name, metric in _averaged(history).items()}),
-            "The metrics are added up: they then depend on the number of minibatches. Average.",
-        ),
-        Misconception(
-            "copy-trained",
-            _updating(trained=copy.deepcopy),
-            "The policy that was handed in has not changed: a copy was trained. Change policy itself, in place.",
-        ),
-    ),
+    misconceptions=wrong(_WRONG_PPO_UPDATE),
     variants={
-        "the gradient on paper": _after(
+        "the gradient on paper": after(
             ch45.fast_ppo_update, lambda metrics: {name: metric.float() for name, metric in metrics.items()}
         ),
         "running sums": _running_sums,
-        "torch.autograd.grad": _by_autograd,
-        "zeros in place of None": _updating(
-            clear=lambda policy: None if policy.weights.grad is None else policy.weights.grad.zero_()
-        ),
+        "torch.autograd.grad": _updating(differentiate=_by_autograd),
+        "zeros in place of None": _updating(differentiate=_from_zero),
     },
 )
 
@@ -1581,6 +1330,30 @@ def _blind(envs, policy, num_steps, obs, generator):
     return _rollout(act=lambda policy, obs, generator: policy.act(first, generator))(envs, policy, num_steps, obs, generator)
 
 
+_STILL_WRONG = ("next-obs-after-reset", "truncated-as-terminated", "clipped-actions-recorded", "mean-action", "restarted")
+_WRONG_REPAIRS = {name: _WRONG_ROLLOUTS[name] for name in _STILL_WRONG} | {
+    "the-suspects-own": (
+        _overwritten(stack_at_the_end=False),
+        "This is the suspect's record. Compare obs[t] with next_obs[t], row by row. What does the array in `obs` hold after the step?",
+    ),
+    "all-rows-alike": (
+        _overwritten(stack_at_the_end=True),
+        "All rows of obs are the last one: a list of references to one array. Copy before the next step, not at the end.",
+    ),
+    "shifted-by-hand": (
+        _rollout(finish=_shifted),
+        "obs is made of next_obs of the row before. After an end that is the last state of the old episode, not the first of the new.",
+    ),
+    "actions-shifted-instead": (
+        _rollout(finish=_rolled_actions),
+        "The actions were moved by a row so that they match the wrong observations: rewards and ends still belong to the rows before.",
+    ),
+    "copied-once": (
+        _blind,
+        "The copy is made before the loop, and the policy acts on it at every step: copy each new observation.",
+    ),
+}
+
 REPAIRED_ROLLOUT = Exercise(
     name="repaired_rollout",
     reference=ch45.repaired_rollout,
@@ -1597,39 +1370,7 @@ REPAIRED_ROLLOUT = Exercise(
         _case("drones that fly away", _collecting("HoverVectorEnv", 12, steps=6, action=1.0, num_envs=3, copy=False)),
         _case("rewards, bounds and both ends", _collecting("TimerVectorEnv", 7, log_std=1.0, **_PAYING), visible=True),
     ),
-    misconceptions=(
-        Misconception(
-            "the-suspects-own",
-            _overwritten(stack_at_the_end=False),
-            "This is the suspect's record. Compare obs[t] with next_obs[t], row by row. What does the array in `obs` hold after the step?",
-        ),
-        Misconception(
-            "all-rows-alike",
-            _overwritten(stack_at_the_end=True),
-            "All rows of obs are the last one: a list of references to one array. Copy before the next step, not at the end.",
-        ),
-        Misconception(
-            "shifted-by-hand",
-            _rollout(finish=_shifted),
-            "obs is made of next_obs of the row before. After an end that is the last state of the old episode, not the first of the new.",
-        ),
-        Misconception(
-            "actions-shifted-instead",
-            _rollout(finish=_rolled_actions),
-            "The actions were moved by a row so that they match the wrong observations: rewards and ends still belong to the rows before.",
-        ),
-        Misconception(
-            "copied-once",
-            _blind,
-            "The copy is made before the loop, and the policy acts on it at every step: copy each new observation.",
-        ),
-        *(
-            mistake
-            for mistake in _COLLECT_MISTAKES
-            if mistake.name
-            in ("next-obs-after-reset", "truncated-as-terminated", "clipped-actions-recorded", "mean-action", "restarted")
-        ),
-    ),
+    misconceptions=wrong(_WRONG_REPAIRS),
     variants={
         "memory made beforehand, filled before the step": _into_memory,
         "columns of arrays": _columns_of_arrays,
