@@ -14,6 +14,7 @@ from autograder.authoring.parts import (
     NUMBER,
     after,
     bad_input_accepted,
+    drawing,
     dtype_lost,
     in_place,
     normal,
@@ -48,44 +49,32 @@ def _arguments(generator, log_ratio, advantages, base=-2.0, **scalars):
     return {"log_probs": old_log_probs + log_ratio, "old_log_probs": old_log_probs, "advantages": advantages} | scalars
 
 
-def _batch(size=33, spread=0.4, base=-2.0, **scalars):
+@drawing
+def _batch(generator, size=33, spread=0.4, base=-2.0, **scalars):
     """Log-ratios of a policy that has moved by `spread`; `base` is the actions' typical log-probability."""
-
-    def inputs(generator):
-        log_ratio = off_bounds(spread * normal(generator, size), **scalars)
-        return _arguments(generator, log_ratio, normal(generator, size) + 0.3, base, **scalars)
-
-    return inputs
+    log_ratio = off_bounds(spread * normal(generator, size), **scalars)
+    return _arguments(generator, log_ratio, normal(generator, size) + 0.3, base, **scalars)
 
 
-def _quadrants(distance, **scalars):
+@drawing
+def _quadrants(generator, distance, **scalars):
     """Ratios well outside on either side, for either sign of the advantage."""
-
-    def inputs(generator):
-        side = torch.tensor([1.0, 1.0, -1.0, -1.0, 1.0], dtype=torch.float64)
-        sign = torch.tensor([1.0, -1.0, 1.0, -1.0, 1.0], dtype=torch.float64)
-        log_ratio = side * distance * (1 + 0.2 * uniform(generator, 5))
-        return _arguments(generator, log_ratio, sign * (0.2 + normal(generator, 5).abs()), **scalars)
-
-    return inputs
+    side = torch.tensor([1.0, 1.0, -1.0, -1.0, 1.0], dtype=torch.float64)
+    sign = torch.tensor([1.0, -1.0, 1.0, -1.0, 1.0], dtype=torch.float64)
+    log_ratio = side * distance * (1 + 0.2 * uniform(generator, 5))
+    return _arguments(generator, log_ratio, sign * (0.2 + normal(generator, 5).abs()), **scalars)
 
 
-def _one_action(side, sign):
+@drawing
+def _one_action(generator, side, sign):
     """One of those quadrants alone, so that nothing else hides it."""
-
-    def inputs(generator):
-        return _arguments(generator, torch.full((1,), side, dtype=torch.float64), sign * (0.2 + normal(generator, 1).abs()))
-
-    return inputs
+    return _arguments(generator, torch.full((1,), side, dtype=torch.float64), sign * (0.2 + normal(generator, 1).abs()))
 
 
-def _constant(log_ratio, **scalars):
+@drawing
+def _constant(generator, log_ratio, **scalars):
     """Every action's probability has changed by the same factor."""
-
-    def inputs(generator):
-        return _arguments(generator, torch.full((7,), log_ratio, dtype=torch.float64), normal(generator, 7) + 0.3, **scalars)
-
-    return inputs
+    return _arguments(generator, torch.full((7,), log_ratio, dtype=torch.float64), normal(generator, 7) + 0.3, **scalars)
 
 
 def _zero_advantage(generator):
@@ -706,15 +695,12 @@ CLIP_FRACTION = Exercise(
 # ------------------------------------------------------------------------------------------------------- repaired_losses
 
 
-def _rollout(epochs=4, size=16, spread=0.35, base=-2.0, **scalars):
+@drawing
+def _rollout(generator, epochs=4, size=16, spread=0.35, base=-2.0, **scalars):
     """Log-probabilities that drift away from those of row 0."""
-
-    def inputs(generator):
-        drift = spread * normal(generator, epochs, size).cumsum(0)
-        drift = off_bounds(drift - drift[0], **scalars)
-        return {"log_probs": drift + base + normal(generator, size), "advantages": normal(generator, size) + 0.3} | scalars
-
-    return inputs
+    drift = spread * normal(generator, epochs, size).cumsum(0)
+    drift = off_bounds(drift - drift[0], **scalars)
+    return {"log_probs": drift + base + normal(generator, size), "advantages": normal(generator, size) + 0.3} | scalars
 
 
 def _standstill(generator):

@@ -12,6 +12,7 @@ from autograder.authoring.parts import (
     NUMBER,
     after,
     bad_input_accepted,
+    drawing,
     dtype_lost,
     in_place,
     integers,
@@ -58,14 +59,11 @@ def _position(generator, steps, envs):
     return int(integers(generator, 1, steps - 1)), int(integers(generator, 0, envs))
 
 
-def _one_end(*flags):
+@drawing
+def _one_end(generator, *flags):
     """An episode of one environment ends, and these flags say how."""
-
-    def inputs(generator):
-        at = [_position(generator, 8, 3)]
-        return _rollout(generator, **{f"{flag}_at": at for flag in flags}) | {"gamma": 0.9, "gae_lambda": 0.8}
-
-    return inputs
+    at = [_position(generator, 8, 3)]
+    return _rollout(generator, **{f"{flag}_at": at for flag in flags}) | {"gamma": 0.9, "gae_lambda": 0.8}
 
 
 _one_terminated = _one_end("terminated")
@@ -498,11 +496,9 @@ COMPUTE_GAE = Exercise(
 # -------------------------------------------------------------------------------------------------------- lambda_returns
 
 
-def _pair(steps=6, envs=3, level=3.0, spread=2.0, scale=1.0):
-    def inputs(generator):
-        return {"advantages": scale * normal(generator, steps, envs), "values": level + spread * normal(generator, steps, envs)}
-
-    return inputs
+@drawing
+def _pair(generator, steps=6, envs=3, level=3.0, spread=2.0, scale=1.0):
+    return {"advantages": scale * normal(generator, steps, envs), "values": level + spread * normal(generator, steps, envs)}
 
 
 _returns = versions_of(ch44.lambda_returns, one_shape(*PAIR), data=PAIR)
@@ -704,12 +700,10 @@ def _bad_critic(generator):
     return {"values": 3 * normal(generator, 8, 3), "returns": normal(generator, 8, 3)}
 
 
-def _right_up_to(offset):
-    def inputs(generator):
-        returns = normal(generator, 8, 3)
-        return {"values": returns + offset, "returns": returns}
-
-    return inputs
+@drawing
+def _right_up_to(generator, offset):
+    returns = normal(generator, 8, 3)
+    return {"values": returns + offset, "returns": returns}
 
 
 def _constant_returns(generator):

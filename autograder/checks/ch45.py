@@ -14,6 +14,7 @@ from autograder.authoring.parts import (
     after,
     bad_input_accepted,
     cut_from_graph,
+    drawing,
     dtype_lost,
     in_place,
     integers,
@@ -45,15 +46,12 @@ def _case(name, inputs, **options):
 # ----------------------------------------------------------------------------------------------------- gaussian_log_prob
 
 
-def _actions(size=7, dims=3, spread=1.0, per_sample=False, base=-0.4):
+@drawing
+def _actions(generator, size=7, dims=3, spread=1.0, per_sample=False, base=-0.4):
     """Actions at `spread` standard deviations from the mean or so."""
-
-    def inputs(generator):
-        mean = normal(generator, size, dims)
-        log_std = base + 0.5 * normal(generator, *((size, dims) if per_sample else (dims,)))
-        return {"mean": mean, "log_std": log_std, "actions": mean + spread * log_std.exp() * normal(generator, size, dims)}
-
-    return inputs
+    mean = normal(generator, size, dims)
+    log_std = base + 0.5 * normal(generator, *((size, dims) if per_sample else (dims,)))
+    return {"mean": mean, "log_std": log_std, "actions": mean + spread * log_std.exp() * normal(generator, size, dims)}
 
 
 def _at_the_mean(generator):
@@ -146,10 +144,7 @@ _WRONG_TERMS = {
         lambda z, s: -_summed(z, s),
         "This is the negative log-likelihood, which one minimises. A ratio needs the log-probability itself.",
     ),
-    "density-instead-of-logarithm": (
-        lambda z, s: _summed(z, s).exp(),
-        "This is the density itself; return its logarithm.",
-    ),
+    "density-instead-of-logarithm": (lambda z, s: _summed(z, s).exp(), "This is the density itself; return its logarithm."),
     "log-std-clamped": (
         lambda z, s: _by_dimension(z * (s - s.clamp(-20, 2)).exp(), s.clamp(-20, 2)).sum(-1),
         "log_std is clamped here. Where a policy limits its width is the policy's affair: use log_std as it comes.",
@@ -255,8 +250,9 @@ GAUSSIAN_LOG_PROB = Exercise(
 _CONSTANT = 0.5 + HALF_LOG_TWO_PI
 
 
-def _widths(*shape, base=-0.5):
-    return lambda generator: {"log_std": base + 0.7 * normal(generator, *shape)}
+@drawing
+def _widths(generator, *shape, base=-0.5):
+    return {"log_std": base + 0.7 * normal(generator, *shape)}
 
 
 def _negated_mean_log_density(log_std):
@@ -342,13 +338,11 @@ GAUSSIAN_ENTROPY = Exercise(
 # ----------------------------------------------------------------------------------------------------------- minibatches
 
 
-def _epochs(batch_size, minibatch_size):
-    def inputs(generator):
-        seed = int(integers(generator, 0, 2**31))
-        sizes = {"batch_size": batch_size, "minibatch_size": minibatch_size}
-        return sizes | {"generator": built("seeding.generator", seed=seed)}
-
-    return inputs
+@drawing
+def _epochs(generator, batch_size, minibatch_size):
+    seed = int(integers(generator, 0, 2**31))
+    sizes = {"batch_size": batch_size, "minibatch_size": minibatch_size}
+    return sizes | {"generator": built("seeding.generator", seed=seed)}
 
 
 def _epoch_case(name, batch_size, minibatch_size, **options):
@@ -540,26 +534,23 @@ MINIBATCHES = Exercise(
 # -------------------------------------------------------------------------------------------------------------- ppo_loss
 
 
-def _update(size=33, spread=0.4, base=-2.0, shared_entropy=False, clip_range=0.2, vf_coef=0.5, ent_coef=0.01):
+@drawing
+def _update(generator, size=33, spread=0.4, base=-2.0, shared_entropy=False, clip_range=0.2, vf_coef=0.5, ent_coef=0.01):
     """A minibatch of a policy that has moved by `spread`, with a critic that is off."""
-
-    def inputs(generator):
-        log_ratio = off_bounds(spread * normal(generator, size), clip_range)
-        old_log_probs = base + normal(generator, size)
-        returns = 3 + 2 * normal(generator, size)
-        return {
-            "log_probs": old_log_probs + log_ratio,
-            "old_log_probs": old_log_probs,
-            "advantages": normal(generator, size) + 0.3,
-            "values": returns + normal(generator, size) - 0.5,
-            "returns": returns,
-            "entropy": 1.5 + 0.3 * normal(generator, *(() if shared_entropy else (size,))),
-            "clip_range": clip_range,
-            "vf_coef": vf_coef,
-            "ent_coef": ent_coef,
-        }
-
-    return inputs
+    log_ratio = off_bounds(spread * normal(generator, size), clip_range)
+    old_log_probs = base + normal(generator, size)
+    returns = 3 + 2 * normal(generator, size)
+    return {
+        "log_probs": old_log_probs + log_ratio,
+        "old_log_probs": old_log_probs,
+        "advantages": normal(generator, size) + 0.3,
+        "values": returns + normal(generator, size) - 0.5,
+        "returns": returns,
+        "entropy": 1.5 + 0.3 * normal(generator, *(() if shared_entropy else (size,))),
+        "clip_range": clip_range,
+        "vf_coef": vf_coef,
+        "ent_coef": ent_coef,
+    }
 
 
 def _before_the_first_step(generator):
@@ -843,22 +834,19 @@ def _vector_env(maker, seed, steps=0, action=0.0, **options):
     return built("control.envs.begun", envs=env, seed=seed, steps=steps, action=action), np.array(running.observe())
 
 
-def _collecting(maker, num_steps, log_std=0.5, steps=0, action=0.0, **options):
+@drawing
+def _collecting(generator, maker, num_steps, log_std=0.5, steps=0, action=0.0, **options):
     """A rollout of `num_steps` steps with a wide policy; `steps` have been made before."""
-
-    def inputs(generator):
-        seeds = integers(generator, 0, 2**31, 3).tolist()
-        envs, obs = _vector_env(maker, seeds[0], steps, action, **options)
-        shape = {"obs_dim": obs.shape[1], "action_dim": 1, "hidden": 4}
-        return {
-            "envs": envs,
-            "policy": built("control.policies.make_policy", log_std=log_std, seed=seeds[1], **shape),
-            "num_steps": num_steps,
-            "obs": obs,
-            "generator": built("seeding.generator", seed=seeds[2]),
-        }
-
-    return inputs
+    seeds = integers(generator, 0, 2**31, 3).tolist()
+    envs, obs = _vector_env(maker, seeds[0], steps, action, **options)
+    shape = {"obs_dim": obs.shape[1], "action_dim": 1, "hidden": 4}
+    return {
+        "envs": envs,
+        "policy": built("control.policies.make_policy", log_std=log_std, seed=seeds[1], **shape),
+        "num_steps": num_steps,
+        "obs": obs,
+        "generator": built("seeding.generator", seed=seeds[2]),
+    }
 
 
 _LENGTHS = {"lengths": (3, 5, 2), "terminates": (True, False, True)}
@@ -1071,51 +1059,45 @@ COLLECT_ROLLOUT = Exercise(
 # ------------------------------------------------------------------------------------------------------------ ppo_update
 
 
-def _updated(size=16, minibatch_size=64, learning_rate=0.01, **settings):
+@drawing
+def _updated(generator, size=16, minibatch_size=64, learning_rate=0.01, **settings):
     """A small policy, and a batch that another has collected. One minibatch for all, so that the order makes no difference."""
+    seeds = integers(generator, 0, 2**31, 2).tolist()
 
-    def inputs(generator):
-        seeds = integers(generator, 0, 2**31, 2).tolist()
+    def drawn(*shape):
+        return normal(generator, *shape).float().numpy()
 
-        def drawn(*shape):
-            return normal(generator, *shape).float().numpy()
-
-        actions = np.float32(0.6) * drawn(size, 2)
-        mean, log_std = torch.zeros(size, 2), torch.full((2,), -0.5)
-        acted = ch45.gaussian_log_prob(mean, log_std, torch.from_numpy(actions)).numpy()
-        batch = {
-            "obs": drawn(size, 3),
-            "actions": actions,
-            "old_log_probs": acted + np.float32(0.25) * drawn(size),
-            "advantages": drawn(size) + np.float32(0.3),
-            "returns": 2 + drawn(size),
-        }
-        chosen = {"num_epochs": 2, "minibatch_size": minibatch_size, "max_grad_norm": 0.5} | settings
-        return {
-            "policy": built("control.policies.make_policy", obs_dim=3, action_dim=2, hidden=4, log_std=-0.5, seed=seeds[0]),
-            "optimizer": built("control.policies.Adam", learning_rate=learning_rate),
-            "batch": built("control.ppo.Batch", **batch),
-            "settings": built("control.ppo.PPOSettings", **chosen),
-            "generator": built("seeding.generator", seed=seeds[1]),
-        }
-
-    return inputs
+    actions = np.float32(0.6) * drawn(size, 2)
+    mean, log_std = torch.zeros(size, 2), torch.full((2,), -0.5)
+    acted = ch45.gaussian_log_prob(mean, log_std, torch.from_numpy(actions)).numpy()
+    batch = {
+        "obs": drawn(size, 3),
+        "actions": actions,
+        "old_log_probs": acted + np.float32(0.25) * drawn(size),
+        "advantages": drawn(size) + np.float32(0.3),
+        "returns": 2 + drawn(size),
+    }
+    chosen = {"num_epochs": 2, "minibatch_size": minibatch_size, "max_grad_norm": 0.5} | settings
+    return {
+        "policy": built("control.policies.make_policy", obs_dim=3, action_dim=2, hidden=4, log_std=-0.5, seed=seeds[0]),
+        "optimizer": built("control.policies.Adam", learning_rate=learning_rate),
+        "batch": built("control.ppo.Batch", **batch),
+        "settings": built("control.ppo.PPOSettings", **chosen),
+        "generator": built("seeding.generator", seed=seeds[1]),
+    }
 
 
-def _near_the_mean(factor):
+@drawing
+def _near_the_mean(generator, factor):
     """Learning rate 0, so that the mean KL of an epoch is known beforehand: target_kl is `factor` times that."""
-
-    def inputs(generator):
-        state = generator.get_state()
-        drawn = _updated(12, 6, learning_rate=0.0)(generator)
-        batch = {name: torch.as_tensor(column) for name, column in drawn["batch"]["arguments"].items()}
-        policy = make_policy(**drawn["policy"]["arguments"])
-        log_probs, *_ = ch45.evaluate_actions(policy, batch["obs"], batch["actions"])
-        kl = ch43.approx_kl(log_probs, batch["old_log_probs"]).item()
-        generator.set_state(state)
-        return _updated(12, 6, learning_rate=0.0, target_kl=factor * kl)(generator)
-
-    return inputs
+    state = generator.get_state()
+    drawn = _updated(12, 6, learning_rate=0.0)(generator)
+    batch = {name: torch.as_tensor(column) for name, column in drawn["batch"]["arguments"].items()}
+    policy = make_policy(**drawn["policy"]["arguments"])
+    log_probs, *_ = ch45.evaluate_actions(policy, batch["obs"], batch["actions"])
+    kl = ch43.approx_kl(log_probs, batch["old_log_probs"]).item()
+    generator.set_state(state)
+    return _updated(12, 6, learning_rate=0.0, target_kl=factor * kl)(generator)
 
 
 def _minibatches_of(batch, settings, generator):
