@@ -76,6 +76,8 @@ def book_view(chapter: Chapter, outputs: Outputs, with_solutions: bool = True, s
         source = (
             cell.source if with_solutions or "book-only" not in cell.tags else "# The edition with solutions shows this cell."
         )
+        if complaint := wordless(cell, executed[key]):
+            raise ChapterError(chapter.path, cell.line, complaint)
         node = _code(key, source, cell.tags - {"live", "book-only"}, executed[key])
         if cell.alt:
             node.metadata["mystnb"] = {"image": {"alt": cell.alt}}
@@ -102,6 +104,14 @@ def nbgrader_view(chapter: Chapter, outputs: Outputs | None = None, sources: Sou
     What `nbgrader generate_assignment` makes of it, under release.write_nbgrader_course's configuration, is the student view.
     """
     return _learner_view(chapter, outputs, sources, teacher=True)
+
+
+def wordless(cell: Cell, outputs: Iterable[NotebookNode]) -> str:
+    """What to do about a cell that shows a picture and does not say in words what is on it; empty if there is no such picture."""
+    kinds = {kind for output in outputs for kind in output.get("data", {}) if kind.startswith("image/")}
+    if not kinds or cell.alt:
+        return ""
+    return "this cell shows a picture: say with the option `alt: …` what is on it, for readers who cannot see it"
 
 
 def _learner_view(chapter: Chapter, outputs: Outputs | None, sources: Sources | None, teacher: bool) -> NotebookNode:

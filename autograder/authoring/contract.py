@@ -10,10 +10,10 @@ import re
 import symtable
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from autograder import paths
 from autograder.authoring.chapter import Cell, Chapter, ChapterError, all_chapters
@@ -32,6 +32,7 @@ class Sources:
     solutions: ModuleType
     references: Path
     pages: Mapping[int, str]  # the chapters that are written, and their pages' names
+    elsewhere: Mapping[str, str] = field(default_factory=dict)  # the exercises of other chapters, and where they stand
 
     def exercise(self, name: str) -> Exercise | Artefact:
         """The checks of one exercise."""
@@ -48,13 +49,41 @@ class Reference:
 
 
 def sources(chapter: Chapter) -> Sources:
-    """The real sources of a chapter of this checkout."""
+    """The real sources of a chapter of this checkout. ChapterError if its checks or its solutions are missing."""
+    chapters = all_chapters()
+    checks = _module(chapter, "checks", "a tuple `EXERCISES`")
+    if not hasattr(checks, "EXERCISES"):
+        raise ChapterError(Path(str(checks.__file__)), 1, "a chapter's checks are its tuple `EXERCISES`, which is missing here")
     return Sources(
-        importlib.import_module(f"autograder.checks.{chapter.assignment}").EXERCISES,
-        importlib.import_module(f"solutions.{chapter.assignment}"),
+        checks.EXERCISES,
+        _module(chapter, "solutions", "its reference functions"),
         paths.REFERENCES,
-        {other.number: other.page for other in all_chapters()},
+        {other.number: other.page for other in chapters},
+        {
+            str(cell.exercise): f"{_shown(other.path)}:{cell.line}"
+            for other in chapters
+            if other.number != chapter.number
+            for cell in other.exercises
+        },
     )
+
+
+def _module(chapter: Chapter, kind: Literal["checks", "solutions"], contents: str) -> ModuleType:
+    """One of the two modules that belong to a chapter, found by their names."""
+    name = f"{'autograder.' * (kind == 'checks')}{kind}.{chapter.assignment}"
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name != name:
+            raise  # it is there, and imports something that is not
+        exercise = f", and so no {kind} of {chapter.exercises[0].exercise}" if chapter.exercises else ""
+        line = chapter.exercises[0].line if chapter.exercises else 1
+        missing = f"there is no {name.replace('.', '/')}.py{exercise}: write it, with {contents}"
+        raise ChapterError(chapter.path, line, missing) from error
+
+
+def _shown(path: Path) -> Path:
+    return path.relative_to(paths.ROOT) if path.is_relative_to(paths.ROOT) else path
 
 
 def references(chapter: Chapter, sources: Sources) -> dict[str, Reference]:
@@ -117,6 +146,10 @@ def _one_of_each(chapter: Chapter, sources: Sources) -> None:
             if name in ids:
                 raise ChapterError(chapter.path, cell.line, f"the id {name!r} is taken by line {ids[str(name)].line}")
             ids[str(name)] = cell
+        if cell.exercise in sources.elsewhere:
+            other = sources.elsewhere[str(cell.exercise)]
+            cure = "an exercise's name occurs once in the course, as its checks are kept by it: choose another"
+            raise ChapterError(chapter.path, cell.line, f"the exercise {cell.exercise} is at {other}, too; {cure}")
     checked = [exercise.name for exercise in sources.exercises]
     if repeated := {name for name in checked if checked.count(name) > 1}:
         raise ChapterError(chapter.path, 1, f"the checks of {chapter.assignment} name {sorted(repeated)[0]} twice")
@@ -127,9 +160,27 @@ def _one_of_each(chapter: Chapter, sources: Sources) -> None:
             raise ChapterError(chapter.path, cell.line, f"{sources.solutions.__name__} lacks {cell.exercise}")
     if stubless := set(checked) - ids.keys():
         raise ChapterError(chapter.path, 1, f"no stub for {', '.join(sorted(stubless))}, which the checks name")
+    _checks_are_sound(chapter, sources)
     for exercise in sources.exercises:
         if abs(sum(exercise.criteria.values()) - exercise.points) > 1e-9:
             raise ChapterError(chapter.path, 1, f"the criteria of {exercise.name} do not add up to {exercise.points:g} points")
+
+
+def _checks_are_sound(chapter: Chapter, sources: Sources) -> None:
+    from autograder.authoring import complaints, freeze, spec  # they load torch, as the checks themselves do
+
+    for exercise in sources.exercises:
+        if isinstance(exercise, spec.Exercise):
+            for complaint in freeze.refusals(exercise):
+                file = complaints.checks_file(exercise)
+                path = paths.ROOT / file if file else chapter.path
+                raise ChapterError(path, _line_of(exercise.name, path), complaint)
+
+
+def _line_of(name: str, path: Path) -> int:
+    """The line of a module in which an exercise gets its name; 1 if none does."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    return next((number for number, line in enumerate(lines, 1) if re.search(rf'^\s*(name=)?"{name}",', line)), 1)
 
 
 def _names_are_known(chapter: Chapter, found: Mapping[str, Reference]) -> None:

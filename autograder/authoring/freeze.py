@@ -1,27 +1,45 @@
 """Turn an exercise's specification into frozen cases: draw the inputs, run the reference and every misconception on them.
 
+The reference is called by name: a case whose arguments are not its own is refused, where a learner's function would be called by position.
 `visible` gives what a learner's notebook gets, `hidden` what the judge uses on top of it. The draws of the two never share a seed.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from autograder.authoring import artefacts
+from autograder.authoring import artefacts, complaints
 from autograder.authoring.spec import Artefact, Case, Exercise
 from course_lib.checks import artefact as files
 from course_lib.checks.cases import FrozenCase, FrozenExercise, Observation, save
-from course_lib.checks.diagnosis import differing_facets, signature, view
+from course_lib.checks.diagnosis import differing_facets, signature, view, with_article
 from course_lib.checks.observing import observe
 
 
 class FreezeError(ValueError):
-    """A specification that contradicts itself; the message names exercise and case."""
+    """A specification that contradicts itself; the message names its file, the exercise and the case."""
+
+    def __init__(self, exercise: Exercise, complaint: str) -> None:
+        file = complaints.checks_file(exercise)
+        super().__init__(f"{file}: {complaint}" if file else complaint)
+
+
+def refusals(exercise: Exercise) -> Iterator[str]:
+    """All that would keep an exercise from being frozen and can be told without calling its reference."""
+    yield from complaints.of_criteria(exercise)
+    for case in exercise.cases:
+        yield from complaints.of_view(exercise, case)
+        try:
+            arguments = _arguments(exercise, case, 0, 0)
+        except Exception as error:  # whatever a slip in the inputs' function provokes
+            yield f"{exercise.name}, case {case.name!r}: no inputs can be drawn, {type(error).__name__}: {error}"
+        else:
+            yield from complaints.of_case(exercise, case, arguments)
 
 
 def visible(exercise: Exercise, seed: int = 0) -> FrozenExercise:
@@ -59,7 +77,9 @@ def _exercise(exercise: Exercise, cases: list[FrozenCase]) -> FrozenExercise:
 
 
 def _freeze(exercise: Exercise, case: Case, seed: int, draw: int, is_visible: bool) -> FrozenCase:
-    inputs = _plain(case.inputs(_generator(exercise, case, seed, draw)), case.dtype)
+    inputs = _arguments(exercise, case, seed, draw)
+    for complaint in complaints.of_case(exercise, case, inputs):
+        raise FreezeError(exercise, complaint)
     frozen = FrozenCase(
         name=case.name,
         arguments=inputs,
@@ -85,12 +105,24 @@ def _freeze(exercise: Exercise, case: Case, seed: int, draw: int, is_visible: bo
 
 
 def _prove(exercise: Exercise, case: Case, frozen: FrozenCase, seen: Callable) -> None:
+    place = f"{exercise.name}, case {case.name!r}"
     for right in frozen.expected:
-        refused = right.error == "ValueError" and any(name in right.message for name in case.raises)
-        if refused != bool(case.raises) or (right.error and not case.raises):
-            raise FreezeError(f"{exercise.name}, case {case.name!r}: the reference does not do what the case says: {right}")
+        if case.raises and not (right.error == "ValueError" and any(name in right.message for name in case.raises)):
+            asked = f"the reference must raise a ValueError that names {' or '.join(case.raises)}"
+            raise FreezeError(exercise, f"{place}: {asked}; it {_ended(right)}")
+        if right.error and not case.raises:
+            raise FreezeError(exercise, f"{place}: the reference {_ended(right)}; a case that it must refuse says so by `raises`")
     if case.closed_form and "values" in differing_facets(seen(case.closed_form), frozen.expected[0], frozen):
-        raise FreezeError(f"{exercise.name}, case {case.name!r}: the reference and the closed form differ")
+        raise FreezeError(exercise, f"{place}: the reference and the closed form differ")
+
+
+def _ended(seen: Observation) -> str:
+    """How a call ended, in words."""
+    return f"raises {seen.error}: {seen.message or 'without a word'}" if seen.error else f"returns {with_article(seen.kind)}"
+
+
+def _arguments(exercise: Exercise, case: Case, seed: int, draw: int) -> dict[str, Any]:
+    return _plain(case.inputs(_generator(exercise, case, seed, draw)), case.dtype)
 
 
 def _generator(exercise: Exercise, case: Case, seed: int, draw: int) -> torch.Generator:

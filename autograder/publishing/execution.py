@@ -29,6 +29,7 @@ from nbclient.util import run_sync
 from nbformat import NotebookNode
 from nbformat.v4 import new_code_cell, new_notebook
 
+from autograder.authoring.assemble import wordless
 from autograder.authoring.chapter import Cell, Chapter
 from autograder.paths import COURSE_LIB, ROOT, RUNS
 from autograder.proving import side_by_side
@@ -216,6 +217,8 @@ def _run_cell(client: NotebookClient, index: int, chapter: Chapter, cell: Cell) 
             raise _failure(chapter, cell, "a cell of the book must not write to stderr", output.text)
         if "application/vnd.jupyter.widget-view+json" in output.get("data", {}):
             raise _failure(chapter, cell, "a page has no kernel for ipywidgets: show plain HTML instead", str(output.data))
+    if complaint := wordless(cell, outputs):
+        raise _failure(chapter, cell, complaint, str(outputs))
     if cell.exercise and "passed" not in str(outputs).lower():
         raise _failure(chapter, cell, "the reference does not pass its check", str(outputs))
 

@@ -198,7 +198,7 @@ def _descriptions(
 def _describe_values(exercise: FrozenExercise, case: FrozenCase, seen: Observation) -> str:
     right = case.expected[0]
     if not _same_form(seen, right):
-        return f"It returns {_a(seen.kind)} where {_a(right.kind)} is asked for."
+        return f"It returns {with_article(seen.kind)} where {with_article(right.kind)} is asked for."
     for key, want in right.outputs.items():
         got = seen.outputs[key]
         label = f"Output {key}: " if key else ""
@@ -258,5 +258,6 @@ def _event(exercise: FrozenExercise, case: FrozenCase, index: tuple[int, ...]) -
     return f" {exercise.axes[0]}={index[0]} is where {exercise.axes[1]} {index[1]} was {' and '.join(said)}."
 
 
-def _a(kind: str) -> str:
+def with_article(kind: str) -> str:
+    """ "a tensor", "an int"."""
     return f"{'an' if kind[:1] in 'aeiou' else 'a'} {kind}"

@@ -80,6 +80,15 @@ def test_live_and_book_only_cells_keep_their_outputs_in_the_book_with_words_for_
     assert cells["ch99-007"].metadata.mystnb.image.alt == "A rising line."
 
 
+def test_a_picture_without_words_is_refused_by_line(tiny):
+    cells = [dataclasses.replace(cell, alt="") for cell in tiny.chapter.cells]
+    wordless = next(cell for cell in cells if "book-only" in cell.tags)
+    with pytest.raises(ChapterError, match=rf"ch99_tiny.md:{wordless.line}: this cell shows a picture: say .* `alt: …`"):
+        assemble.book_view(
+            dataclasses.replace(tiny.chapter, cells=tuple(cells)), tiny.outputs, sources=tiny.sources(tiny.chapter)
+        )
+
+
 def test_a_book_without_solutions_holds_no_line_of_them(views):
     text = nbformat.writes(views["unsolved"])
     for line in ("total = x + x", "adding needs no", "validate.unit_interval", "for _ in range", "Reference solution"):

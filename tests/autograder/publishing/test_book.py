@@ -152,6 +152,12 @@ def test_a_warning_on_a_page_is_an_error(tmp_path, monkeypatch):
         execution.executed_outputs(chapter)
 
 
+def test_a_picture_without_words_ends_the_run_at_its_cell(tmp_path, monkeypatch):
+    code = "from IPython.display import SVG\nSVG('<svg xmlns=\"http://www.w3.org/2000/svg\"/>')"
+    with pytest.raises(execution.BookError, match=r"ch97_one\.md:\d+: .*: this cell shows a picture: say with the option `alt"):
+        execution.executed_outputs(chapter_with(tmp_path, monkeypatch, code))
+
+
 def test_outputs_are_those_of_each_code_cell_and_come_from_the_cache_the_second_time(tmp_path, monkeypatch):
     chapter = chapter_with(tmp_path, monkeypatch, "import os\nprint(os.environ['COURSE_BOOK'], os.environ['OMP_NUM_THREADS'])")
     [[output]] = execution.executed_outputs(chapter)
