@@ -147,12 +147,43 @@ def _gradients_agree(seen: Observation, target: Observation, case: FrozenCase) -
 
 
 def _explanations(exercise: FrozenExercise, pairs: list[tuple[FrozenCase, Observation]], failed: list[str]) -> list[str]:
-    """What explains all that was seen or, failing that, all wrong values: a leaking gradient beside them can wait."""
+    """The misconceptions that did all that they do or, failing that, those that did what they do to the values: a leaking gradient beside
+    wrong values can wait.
+
+    An example. Where 1 is right, `doubled` returns 2, `greedy` changes its input `x`, `sloppy` does both, and `tripled` returns 3 and
+    changes `x`.
+
+    >>> def did(value, changed=()):
+    ...     return Observation(kind="float", outputs={"": np.array(value)}, mutated=list(changed))
+    >>> wrong = {"doubled": did(2.0), "greedy": did(1.0, ["x"]), "sloppy": did(2.0, ["x"]), "tripled": did(3.0, ["x"])}
+    >>> case = FrozenCase("one", {}, [did(1.0)], wrong)
+    >>> facets = {name: signature(name, [case]) for name in wrong}
+    >>> facets
+    {'doubled': ['values'], 'greedy': ['inputs'], 'sloppy': ['inputs', 'values'], 'tripled': ['inputs', 'values']}
+    >>> exercise = FrozenExercise("f", {"values": 1.0, "inputs": 1.0}, dict.fromkeys(wrong, "…"), [case], facets)
+    >>> def named(seen):
+    ...     failed = [facet for facet in FACET_TEXT if facet in differing_facets(seen, did(1.0), case)]
+    ...     return _explanations(exercise, [(case, seen)], failed)
+
+    `doubled`, `greedy` and `sloppy` all fit. `sloppy` explains most, and of those that explain strictly less none is named beside it:
+
+    >>> named(did(2.0, ["x"]))
+    ['sloppy']
+
+    Here `sloppy` is ruled out, as `x` is left alone; there everything but `greedy`, as the values are right:
+
+    >>> named(did(2.0)), named(did(1.0, ["x"]))
+    (['doubled'], ['greedy'])
+
+    `tripled` changes `x`, not `y`, so this is not all that it does; but nothing else fits, and it explains the wrong values. That
+    `greedy` fits does not help someone whose values are wrong for another reason:
+
+    >>> named(did(3.0, ["y"])), named(did(4.0, ["x"]))
+    (['tripled'], [])
+    """
     if "values" not in failed:
         return _explaining(exercise, pairs, failed, set(FACET_TEXT))
-    return _explaining(exercise, pairs, failed, set(FACET_TEXT), "values") or _explaining(
-        exercise, pairs, failed, {"values"}, "values"
-    )
+    return _explaining(exercise, pairs, failed, set(FACET_TEXT), "values") or _explaining(exercise, pairs, failed, {"values"})
 
 
 def _explaining(
@@ -162,8 +193,11 @@ def _explaining(
     considered: set[str],
     foremost: str = "",
 ) -> list[str]:
-    """The misconceptions whose `considered` facets were all seen as they would show them. With wrong values, one that is about something
-    else only would name a scratch on a wreck: `foremost` must be among the facets."""
+    """The misconceptions whose `considered` facets were all seen as they would show them, in every case; see `_explanations`.
+
+    One that is wrong in none of these facets explains nothing, and one that is wrong in a facet that did not fail is not what happened.
+    With wrong values, one that is about something else only would name a scratch on a wreck: `foremost` must be among the facets.
+    """
 
     def explains(name: str, facets: set[str]) -> bool:
         if not facets or not facets <= set(failed) or (foremost and foremost not in facets):
