@@ -124,7 +124,7 @@ class Adam:
         m ← β₁ m + (1 - β₁) g,   v ← β₂ v + (1 - β₂) g²,   w ← w - α m̂ / (√v̂ + ε),   m̂ = m / (1 - β₁ᵗ),   v̂ = v / (1 - β₂ᵗ)
 
     Kingma and Ba (2015), algorithm 1, https://arxiv.org/abs/1412.6980. The same arithmetic as `torch.optim.Adam`, whose bookkeeping
-    takes longer than that.
+    takes longer than that. PPO has one of its own, `course_lib.control.policies.Adam`, which rounds otherwise; it says why there are two.
 
     Args:
       weights: tensor, changed in place by each step.
