@@ -1,7 +1,8 @@
 """Reads chapters/chNN_name.md, a MyST notebook, into a Chapter; whatever the format does not allow is refused by file and line.
 
-The format: front matter (see `_FRONT_MATTER`), prose in markdown cells, code cells with a YAML option block (`_OPTIONS`). A code
+The format: front matter (see `FRONT_MATTER`), prose in markdown cells, code cells with a YAML option block (`OPTIONS`). A code
 cell with the option `exercise` is a stub; a markdown cell opened by `+++ {"open_question": id, "points": n}` is graded by hand.
+What is accepted stands in tables with a line on each entry, which the book prints (autograder.publishing.format_page).
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import yaml
 from jupytext.myst import MystMetadataParsingError, myst_to_notebook
@@ -18,14 +19,55 @@ from autograder import paths
 
 ANSWER_LINE = "*Write your answer here.*"
 
-_FRONT_MATTER = {"chapter": int, "title": str, "minutes": int, "prerequisites": list, "builds": str, "summary": str}
-_OPTIONAL = {"experiments": list}
-_ABOUT_THE_FORMAT = {"jupytext", "kernelspec", "jupyter", "source_map"}
-_OPTIONS = {"tags": list, "exercise": str, "difficulty": int, "minutes": int, "alt": str}
-_QUESTION = {"open_question": str, "points": (int, float)}
-_TAGS = {"live", "book-only", "full-width", "margin", "output_scroll", "raises-exception"} | {
-    f"{verb}-{part}" for verb in ("hide", "remove") for part in ("input", "output", "cell")
+
+class Option(NamedTuple):
+    """Something that a chapter can say: the type of its value, and what it is for, in a line of Markdown."""
+
+    type: type | tuple[type, ...]
+    says: str
+
+
+FRONT_MATTER = {
+    "chapter": Option(int, "The chapter's number NN; its file is called `chNN_name.md`."),
+    "title": Option(str, "The title, without the number."),
+    "minutes": Option(int, "How long a learner needs, exercises included."),
+    "prerequisites": Option(list, "The numbers of the chapters to read before this one; `[]` if there are none."),
+    "builds": Option(str, "What the learner will have built, to follow *You will have built:*."),
+    "summary": Option(str, "What the chapter is about, for the list on the front page: a sentence or two."),
 }
+OPTIONAL = {
+    "experiments": Option(list, "The experiments whose records the page loads; they are handed out with the notebook."),
+}
+OPTIONS = {
+    "tags": Option(list, "How the cell is run and shown, see below."),
+    "exercise": Option(
+        str, "Makes the cell the stub of this function: its signature, its docstring and `raise NotImplementedError`."
+    ),
+    "difficulty": Option(int, "Of an exercise: 1, 2 or 3."),
+    "minutes": Option(int, "Of an exercise: how long it takes."),
+    "alt": Option(
+        str, "What the cell's picture shows, in words, for those who cannot see it; every cell with a picture needs it."
+    ),
+}
+QUESTION = {
+    "open_question": Option(str, "Opens a question that a person grades; the value is its name."),
+    "points": Option((int, float), "What the question is worth, above 0."),
+}
+TAGS = {
+    "live": "The cell runs when the book is built, and in learners' notebooks if they wish; never when work is graded. Plots and training.",
+    "book-only": "With `live`: learners see what the cell gave, not the cell. For code that holds answers or needs minutes.",
+    "full-width": "The output may be as wide as the window.",
+    "margin": "The cell stands in the margin.",
+    "output_scroll": "A long output scrolls in a box.",
+    "raises-exception": "The cell is meant to fail, and the page shows how.",
+    "hide-input": "The code is folded; its output is not.",
+    "hide-output": "The output is folded.",
+    "hide-cell": "Code and output are folded.",
+    "remove-input": "The page shows the output alone.",
+    "remove-output": "The page shows the code alone.",
+    "remove-cell": "The cell runs, and the page does not show it.",
+}
+_ABOUT_THE_FORMAT = {"jupytext", "kernelspec", "jupyter", "source_map"}
 _IDENTIFIER = re.compile(r"[A-Za-z]\w{0,50}")
 
 
@@ -121,7 +163,7 @@ def parse(path: Path) -> Chapter:
     except (MystMetadataParsingError, yaml.YAMLError) as error:
         raise ChapterError(path, 1, f"unreadable options: {error}") from error
     front = {key: value for key, value in notebook.metadata.items() if key not in _ABOUT_THE_FORMAT}
-    _expect(path, 1, "front matter", front, _FRONT_MATTER | _OPTIONAL, required=set(_FRONT_MATTER))
+    _expect(path, 1, "front matter", front, FRONT_MATTER | OPTIONAL, required=set(FRONT_MATTER))
     if not path.name.startswith(f"ch{front['chapter']}_"):
         raise ChapterError(path, 1, f"chapter {front['chapter']} must lie in a file called ch{front['chapter']}_*.md")
     lines = text.splitlines()
@@ -144,10 +186,10 @@ def _cell(path: Path, cell: Any, start: int, lines: list[str]) -> Cell:
     """One notebook cell of jupytext's as a Cell; `start` is jupytext's line, before any blank lines that it has dropped."""
     options = dict(cell.metadata)
     if cell.cell_type == "code":
-        _expect(path, start, "code cell", options, _OPTIONS)
+        _expect(path, start, "code cell", options, OPTIONS)
         tags = frozenset(options.pop("tags", ()))
-        if unknown := tags - _TAGS:
-            raise ChapterError(path, start, f"unknown tag {sorted(unknown)[0]!r}; known: {', '.join(sorted(_TAGS))}")
+        if unknown := tags - TAGS.keys():
+            raise ChapterError(path, start, f"unknown tag {sorted(unknown)[0]!r}; known: {', '.join(sorted(TAGS))}")
         if "book-only" in tags and "live" not in tags:
             raise ChapterError(path, start, "a book-only cell is never run by the judge: tag it live, too")
         if "exercise" in options:
@@ -159,7 +201,7 @@ def _cell(path: Path, cell: Any, start: int, lines: list[str]) -> Cell:
         raise ChapterError(path, start, f"a {cell.cell_type} cell is not used here")
     while not lines[start].strip():
         start += 1
-    _expect(path, start + 1, "markdown cell", options, _QUESTION, required=set(_QUESTION) if options else set())
+    _expect(path, start + 1, "markdown cell", options, QUESTION, required=set(QUESTION) if options else set())
     if options and (options["points"] <= 0 or not _IDENTIFIER.fullmatch(options["open_question"])):
         raise ChapterError(path, start + 1, "an open question needs points above 0 and a plain identifier as its name")
     if options and cell.source.split("\n")[-1] != ANSWER_LINE:
@@ -177,13 +219,13 @@ def _stub_options(path: Path, line: int, tags: frozenset[str], options: dict[str
 
 
 def _expect(
-    path: Path, line: int, where: str, found: dict[str, Any], types: dict[str, Any], required: set[str] | None = None
+    path: Path, line: int, where: str, found: dict[str, Any], known: dict[str, Option], required: set[str] | None = None
 ) -> None:
     """Refuse missing and unknown keys, and values of another type."""
-    if unknown := found.keys() - types.keys():
-        raise ChapterError(path, line, f"unknown option {sorted(unknown)[0]!r} in a {where}; known: {', '.join(types)}")
+    if unknown := found.keys() - known.keys():
+        raise ChapterError(path, line, f"unknown option {sorted(unknown)[0]!r} in a {where}; known: {', '.join(known)}")
     if missing := (required or set()) - found.keys():
         raise ChapterError(path, line, f"{where} lacks {', '.join(sorted(missing))}")
     for key, value in found.items():
-        if not isinstance(value, types[key]) or isinstance(value, bool):
+        if not isinstance(value, known[key].type) or isinstance(value, bool):
             raise ChapterError(path, line, f"{key}: {value!r} in a {where} has the wrong type")

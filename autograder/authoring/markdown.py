@@ -12,13 +12,31 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from string import ascii_uppercase
-from typing import ClassVar
 
 from autograder.authoring.bibliography import References
 
 ADMONITIONS = {"note": "Note", "tip": "Tip", "warning": "Warning", "important": "Important"}
-DIRECTIVES = {*ADMONITIONS, "admonition", "dropdown", "margin", "math", "quiz"}
-OPTIONS = {"class", "open", "label"}
+DIRECTIVES = {
+    "note": "A box, headed *Note*; a title on its first line stands in it.",
+    "tip": "A box, headed *Tip*.",
+    "warning": "A box, headed *Warning*.",
+    "important": "A box, headed *Important*.",
+    "admonition": "A box with the title on its first line.",
+    "dropdown": "A fold with the title on its first line. Hints are folds, `:::{dropdown} Hint 1 for compute_gae: where the mask goes`.",
+    "margin": "A note in the margin, in place of a footnote.",
+    "math": "A displayed equation, as `$$ … $$` is.",
+    "quiz": "A question on the first line, then answers, `- [ ] answer: explanation`, of which one is right, `- [x]`.",
+}
+OPTIONS = {
+    "class": "A style: `dropdown` folds an admonition.",
+    "open": "A fold that begins open.",
+    "label": "Of an equation: numbers it, for references to it.",
+}
+ROLES = {
+    "cite:t": "A citation that is part of the sentence, by its key in `book/references.bib`: Schulman et al. (2017).",
+    "cite:p": "The same in parentheses: (Schulman et al., 2017).",
+    "eq": "The number of an equation of this chapter, by its label.",
+}
 
 _CODE_FENCE = re.compile(r"\s*(?:>\s*)*(?P<fence>`{3,}|~{3,})(?P<info>.*)")
 _DIRECTIVE = re.compile(r"(?P<fence>:{3,})\{(?P<name>[^}]*)\}\s*(?P<argument>.*?)\s*")
@@ -86,16 +104,14 @@ class Choice:
 class Dialect(ABC):
     """How one kind of page writes what is not plain Markdown. `cited` collects the keys that a text cites, in order."""
 
-    roles: ClassVar = {"cite:t", "cite:p", "eq"}
-
     def __init__(self, assignment: str, equations: Mapping[str, str], references: References, pages: Mapping[int, str]) -> None:
         self.assignment, self.equations, self.references, self.pages = assignment, equations, references, pages
         self.cited: dict[str, None] = {}
 
     def role(self, name: str, content: str, line: int) -> str:
         """One role, {name}`content`."""
-        if name not in self.roles:
-            raise MarkdownError(line, f"unknown role {{{name}}}; known: {', '.join(sorted(self.roles))}")
+        if name not in ROLES:
+            raise MarkdownError(line, f"unknown role {{{name}}}; known: {', '.join(sorted(ROLES))}")
         if name == "eq":
             if content not in self.equations:
                 raise MarkdownError(line, f"no equation of this chapter is labelled {content!r}")
@@ -236,7 +252,7 @@ def labels(text: str, line: int = 1) -> Iterator[tuple[str, int]]:
     for block in parse(text, line):
         if block.label:
             yield block.label, block.line
-        if block.kind in DIRECTIVES - {"math"}:
+        if block.kind in DIRECTIVES.keys() - {"math"}:
             yield from labels(block.text, block.body_line)
 
 

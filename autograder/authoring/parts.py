@@ -159,14 +159,17 @@ def bad_input_accepted(answer: Callable, message: str = SHAPES) -> Misconception
 
 
 def dtype_lost(function: Callable) -> Misconception:
+    """Right, but in another dtype."""
     return Misconception("dtype-lost", after(function, torch.Tensor.float), DTYPE)
 
 
 def python_float(function: Callable, message: str = SCALAR) -> Misconception:
+    """Right, but a Python float in place of a tensor."""
     return Misconception("python-float", after(function, torch.Tensor.item), message)
 
 
 def cut_from_graph(function: Callable) -> Misconception:
+    """Right, but without a graph."""
     return Misconception("cut-from-graph", after(function, torch.Tensor.detach), CUT)
 
 

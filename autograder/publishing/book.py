@@ -30,6 +30,7 @@ from autograder.authoring.chapter import Chapter, all_chapters
 from autograder.paths import ROOT
 from autograder.proving.locks import one_at_a_time
 from autograder.publishing.execution import BookError, cache_folder, content_hash, executed_outputs, execution_key, run_all
+from autograder.publishing.format_page import format_page
 
 if TYPE_CHECKING:
     from autograder.proving.kept import Keys
@@ -81,6 +82,7 @@ def staged_files(chapters: list[Chapter], with_solutions: bool) -> dict[str, byt
     files = {path.relative_to(BOOK).as_posix(): path.read_bytes() for path in pages}
     files["index.md"] = _front_page(files["index.md"].decode(), chapters).encode()
     files["notation.md"] = notation_page(yaml.safe_load((BOOK / "notation.yml").read_text(encoding="utf-8"))).encode()
+    files["format.md"] = format_page().encode()
     files["_toc.yml"] = yaml.safe_dump(table_of_contents(chapters), sort_keys=False, allow_unicode=True).encode()
     for chapter in chapters:
         outputs = executed_outputs(chapter)
@@ -107,7 +109,7 @@ def docname(chapter: Chapter) -> str:
 def table_of_contents(chapters: list[Chapter]) -> dict:
     """sphinx-external-toc's table, from the chapters' front matter."""
     entries = [{"file": docname(chapter), "title": f"{chapter.number}. {chapter.title}"} for chapter in chapters]
-    appendices = [{"file": "notation"}, {"file": "kill-matrix"}]
+    appendices = [{"file": "notation"}, {"file": "kill-matrix"}, {"file": "format"}]
     how_to = {"caption": "How to use this book", "chapters": [{"file": page} for page in HOW_TO]}
     parts = [how_to, {"caption": "Chapters", "chapters": entries}, {"caption": "Appendices", "chapters": appendices}]
     return {"format": "jb-book", "root": "index", "parts": parts}
