@@ -156,15 +156,15 @@ def experiment(
     """Make the records of long runs that are missing. Killed, it loses nothing: run it again. Exit status 3 if a run failed."""
     from collections import Counter
 
-    from experiments import runner
+    from experiments import campaign
 
-    folder = out or runner.RUNS
+    folder = out or campaign.RUNS
     if name is None:
-        print("\n".join(_state(one, folder) for one in runner.names()))
+        print("\n".join(_state(one, folder) for one in campaign.names()))
         return
     try:
-        todo = runner.tasks(runner.definition(name), variant or (), seeds, folder)
-    except runner.ExperimentError as error:
+        todo = campaign.tasks(campaign.definition(name), variant or (), seeds, folder)
+    except campaign.ExperimentError as error:
         _stop(error)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     outcomes = []
@@ -178,7 +178,7 @@ def experiment(
             bar.update(bars[variant, seed], completed=done, total=total)
 
         try:
-            for outcome in runner.make(todo, jobs, scheduler, show):
+            for outcome in campaign.make(todo, jobs, scheduler, show):
                 outcomes.append(outcome)
                 bar.advance(whole)
                 if (outcome.variant, outcome.seed) in bars:
@@ -198,10 +198,10 @@ def _state(name: str, folder: Path) -> str:
     """One experiment in a few lines: what it measures, and how many of its runs have a record."""
     from collections import Counter
 
-    from experiments import runner
+    from experiments import campaign
 
-    module = runner.definition(name)
-    found = Counter(runner.state(task) for task in runner.tasks(module, out=folder))
+    module = campaign.definition(name)
+    found = Counter(campaign.state(task) for task in campaign.tasks(module, out=folder))
     counts = ", ".join(f"{count} {kind}" for kind, count in sorted(found.items()))
     return f"{name}: {(module.__doc__ or '').strip().splitlines()[0]}\n    {counts}"
 

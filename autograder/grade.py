@@ -80,7 +80,7 @@ def _write_all(
         gradebook,
     )
 
-    releases = {page.assignment: assemble.student_view(page) for page in chapter.all_chapters()}
+    releases = {page.assignment: assemble.for_learners(page) for page in chapter.all_chapters()}
     gradebook.write_course(out, releases, db_url)
     results = []
     with gradebook.GradebookWriter(db_url or f"sqlite:///{(out / 'gradebook.db').resolve()}") as book:

@@ -8,7 +8,7 @@ ROOT = Path(__file__).resolve().parent.parent
 CHAPTERS = ROOT / "chapters"
 COURSE_LIB = ROOT / "course_lib"
 RUNS = ROOT / "experiments" / "runs"
-REFERENCES = ROOT / "book" / "references.bib"
+BIBLIOGRAPHY = ROOT / "book" / "references.bib"
 
 
 def checkout(root: Path = ROOT) -> Path:

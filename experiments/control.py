@@ -27,7 +27,7 @@ from course_lib.control.ppo import PPOSettings
 from course_lib.control.rollouts import EpisodeReturns
 from course_lib.control.sac import SACSettings
 from experiments import checkpoint, snapshots
-from experiments.runner import Report, Result
+from experiments.campaign import Report, Result
 from solutions import ch45, ch48
 
 ENVIRONMENTS = {

@@ -23,7 +23,7 @@ from course_lib.language.judges import gold_judge
 from course_lib.language.reward_models import RewardModel, fit
 from course_lib.language.rlhf import whole_texts
 from experiments import rlhf
-from experiments.runner import Report, Result
+from experiments.campaign import Report, Result
 from solutions.ch96 import last_token_scores, reward_model_loss
 from solutions.ch97 import dpo_loss, ipo_loss, sequence_logps
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from experiments.campaign import Report, Result
 from experiments.control import CHUNK, ENVIRONMENTS, SAC_SETTINGS, SACRun, configuration, followed
-from experiments.runner import Report, Result
 
 TASKS = ("hopper", "walker2d", "halfcheetah")
 SETTINGS = {f"sac_{task}": SAC_SETTINGS[task].but(total_steps=300_000) for task in TASKS}

@@ -21,7 +21,7 @@ from course_lib.control.demonstrations import Clone, Demonstrations
 from course_lib.control.policies import load_policy
 from course_lib.figures import records, videos
 from course_lib.seeding import seed_everything
-from experiments.runner import Report, Result
+from experiments.campaign import Report, Result
 from solutions.ch74 import collect_demonstrations, gaussian_cloning_loss, state_shift, train_bc
 
 ENVIRONMENT = "LunarLanderContinuous-v3"

@@ -25,7 +25,7 @@ from course_lib.control import envs
 from course_lib.control.policies import ActorCritic, load_policy, policy_for, save_policy
 from course_lib.control.ppo import LANDER_SETTINGS, PPOSettings
 from course_lib.figures import videos
-from experiments.runner import Report, Result
+from experiments.campaign import Report, Result
 from solutions import ch44, ch45
 
 ENVIRONMENT, NUM_ENVS = "LunarLanderContinuous-v3", 16

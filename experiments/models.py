@@ -23,8 +23,8 @@ from PIL import Image, ImageDraw
 from course_lib.control import mbpo
 from course_lib.control.mbpo import MBPOSettings
 from course_lib.figures import videos
+from experiments.campaign import Report, Result
 from experiments.control import ENVIRONMENTS, EPISODES, SACRun, followed
-from experiments.runner import Report, Result
 from solutions import ch48, ch51
 
 PENDULUM = MBPOSettings()

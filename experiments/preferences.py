@@ -10,7 +10,7 @@ import torch
 from course_lib.control import clips, envs, tasks
 from course_lib.control.policies import make_policy, policy_for
 from course_lib.control.ppo import PPOSettings
-from experiments.runner import Result
+from experiments.campaign import Result
 from solutions.ch45 import collect_rollout, evaluate_actions, fast_ppo_update, train_ppo
 from solutions.ch80 import bradley_terry_loss, preference_accuracy, segment_returns, simulate_preferences
 

@@ -19,7 +19,7 @@ from course_lib.language.fine_tuning import Taught, TokenPPO, Writer, openings, 
 from course_lib.language.judges import gold_judge
 from course_lib.language.reward_models import RewardModel, fit
 from course_lib.language.rlhf import Proxy, liked_texts, next_token_loss, supervised, whole_texts
-from experiments.runner import Report, Result
+from experiments.campaign import Report, Result
 from solutions import ch45, ch95, ch96
 
 PPO = TokenPPO(batch=48, new_tokens=16, minibatch=24, learning_rate=4e-4)

@@ -20,8 +20,8 @@ import numpy as np
 from course_lib.control import envs, sac
 from course_lib.control.policies import policy_for
 from course_lib.control.ppo import PPOSettings
+from experiments.campaign import Report, Result
 from experiments.control import NUM_ENVS, PPO_SETTINGS, evaluate
-from experiments.runner import Report, Result
 from solutions import ch45, ch48
 
 ENVIRONMENT = "Pendulum-v1"

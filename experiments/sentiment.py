@@ -15,7 +15,7 @@ import torch
 
 from course_lib.language import fine_tuning, lm
 from course_lib.language.fine_tuning import Taught, TokenPPO, Writer, Writing, openings, train, vader_scores
-from experiments.runner import Report, Result
+from experiments.campaign import Report, Result
 from solutions import ch45, ch95
 
 BASE = {"kl_coef": 0.01, "iterations": 24, "learning_rate": 6e-4}

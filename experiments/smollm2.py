@@ -20,7 +20,7 @@ from course_lib.language import lm, preferences
 from course_lib.language.direct import Pairs, encode_pairs, like_lengths, reference_logps, train_step
 from course_lib.language.fine_tuning import Taught, TokenPPO, Writer, Writing, openings, train, vader_scores
 from course_lib.seeding import seed_everything
-from experiments.runner import Report, Result
+from experiments.campaign import Report, Result
 from solutions import ch45, ch95
 from solutions.ch96 import reward_model_loss
 from solutions.ch97 import dpo_loss, sequence_logps

@@ -51,7 +51,7 @@ def main(count: int) -> None:
     with tempfile.TemporaryDirectory() as name:
         base = Path(name)
         course = release.write_nbgrader_course(base / "nbgrader")
-        released = assemble.student_view(chapter.load("ch44"))
+        released = assemble.for_learners(chapter.load("ch44"))
         for number in range(count):
             folder = course / "submitted" / f"s{number:03}" / "ch44"
             folder.mkdir(parents=True)

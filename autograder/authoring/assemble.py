@@ -1,7 +1,7 @@
 """One chapter, three renderings: a page for the book, a notebook for learners, a source notebook for nbgrader.
 
-All views are nbformat 4.5 and the same bytes for the same input. Cell ids follow from positions and names, and are the same in
-all views: `ch44-007` for the chapter's own cells, `ch44-test_compute_gae` for the check after a stub. `outputs` always has one
+All renderings are nbformat 4.5 and the same bytes for the same input. Cell ids follow from positions and names, and are the same in
+all renderings: `ch44-007` for the chapter's own cells, `ch44-test_compute_gae` for the check after a stub. `outputs` always has one
 list of outputs for each code cell of the chapter, in order; a stub's are those of its check. Errors are ChapterErrors that name
 file and line.
 """
@@ -18,7 +18,7 @@ from nbformat import NotebookNode
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 from autograder.authoring import markdown
-from autograder.authoring.bibliography import References
+from autograder.authoring.bibliography import Bibliography
 from autograder.authoring.chapter import ANSWER_LINE, Cell, Chapter, ChapterError
 from autograder.authoring.contract import STUB, Reference, Sources, references
 from autograder.authoring.contract import sources as real_sources
@@ -31,7 +31,7 @@ _ANSI = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 
 
 @dataclass(frozen=True)
-class Assignment:
+class Outline:
     """What a chapter asks for: names and points, in the chapter's order."""
 
     id: str
@@ -39,10 +39,10 @@ class Assignment:
     open_questions: tuple[tuple[str, float], ...]
 
 
-def assignment(chapter: Chapter, sources: Sources | None = None) -> Assignment:
+def outline(chapter: Chapter, sources: Sources | None = None) -> Outline:
     """The graded items of a chapter."""
     sources = sources or real_sources(chapter)
-    return Assignment(
+    return Outline(
         chapter.assignment,
         tuple((str(cell.exercise), float(sources.exercise(str(cell.exercise)).points)) for cell in chapter.exercises),
         tuple((str(cell.open_question), float(cell.points)) for cell in chapter.open_questions),
@@ -50,13 +50,13 @@ def assignment(chapter: Chapter, sources: Sources | None = None) -> Assignment:
 
 
 def verify(chapter: Chapter, sources: Sources | None = None) -> None:
-    """Raise ChapterError unless the chapter keeps its contract: exercises, references and checks agree, and all views render."""
+    """Raise ChapterError unless the chapter keeps its contract: exercises, references and checks agree, and everything renders."""
     sources = sources or real_sources(chapter)
-    student_view(chapter, sources=sources)
-    book_view(chapter, [[] for cell in chapter.cells if cell.kind == "code"], sources=sources)
+    for_learners(chapter, sources=sources)
+    for_book(chapter, [[] for cell in chapter.cells if cell.kind == "code"], sources=sources)
 
 
-def book_view(chapter: Chapter, outputs: Outputs, with_solutions: bool = True, sources: Sources | None = None) -> NotebookNode:
+def for_book(chapter: Chapter, outputs: Outputs, with_solutions: bool = True, sources: Sources | None = None) -> NotebookNode:
     """The page as MyST for Jupyter Book (`execute_notebooks: "off"`): stubs, executed outputs, folded references.
 
     Nothing of a reference is in it if not with_solutions, nor the source of book-only cells, which may hold answers.
@@ -90,20 +90,20 @@ def book_view(chapter: Chapter, outputs: Outputs, with_solutions: bool = True, s
     return _notebook(_page(chapter, sources, dialect, stub, code, question))
 
 
-def student_view(chapter: Chapter, outputs: Outputs | None = None, sources: Sources | None = None) -> NotebookNode:
+def for_learners(chapter: Chapter, outputs: Outputs | None = None, sources: Sources | None = None) -> NotebookNode:
     """The learner's notebook: plain Markdown, stubs, locked checks; what only the book can run, as recorded output.
 
     Without `outputs` such cells become a sentence that says where to see the result.
     """
-    return _learner_view(chapter, outputs, sources, teacher=False)
+    return _notebook_of(chapter, outputs, sources, teacher=False)
 
 
-def nbgrader_view(chapter: Chapter, outputs: Outputs | None = None, sources: Sources | None = None) -> NotebookNode:
-    """nbgrader's source notebook: the student view with solution regions and hidden tests.
+def for_nbgrader(chapter: Chapter, outputs: Outputs | None = None, sources: Sources | None = None) -> NotebookNode:
+    """nbgrader's source notebook: the learner's notebook with solution regions and hidden tests.
 
-    What `nbgrader generate_assignment` makes of it, under release.write_nbgrader_course's configuration, is the student view.
+    What `nbgrader generate_assignment` makes of it, under release.write_nbgrader_course's configuration, is the learner's notebook.
     """
-    return _learner_view(chapter, outputs, sources, teacher=True)
+    return _notebook_of(chapter, outputs, sources, teacher=True)
 
 
 def wordless(cell: Cell, outputs: Iterable[NotebookNode]) -> str:
@@ -114,7 +114,7 @@ def wordless(cell: Cell, outputs: Iterable[NotebookNode]) -> str:
     return "this cell shows a picture: say with the option `alt: …` what is on it, for readers who cannot see it"
 
 
-def _learner_view(chapter: Chapter, outputs: Outputs | None, sources: Sources | None, teacher: bool) -> NotebookNode:
+def _notebook_of(chapter: Chapter, outputs: Outputs | None, sources: Sources | None, teacher: bool) -> NotebookNode:
     sources = sources or real_sources(chapter)
     solutions = references(chapter, sources)
     executed = _outputs(chapter, outputs) if outputs is not None else {}
@@ -155,7 +155,7 @@ def _page(
     code: Callable[[str, Cell], NotebookNode],
     question: Callable[[str, Cell, str], NotebookNode],
 ) -> Iterator[NotebookNode]:
-    """The cells of a page in order: what the views share, with their own ways to write stubs, code and questions."""
+    """The cells of a page in order: what the renderings share, with their own ways to write stubs, code and questions."""
     yield _markdown(f"{chapter.assignment}-front", _render(_front(chapter, sources), dialect, chapter, 1))
     number = 0
     for position, (key, cell) in enumerate(_keyed(chapter)):
@@ -254,7 +254,7 @@ def _dialect(kind: type[markdown.Dialect], chapter: Chapter, sources: Sources) -
                 if label in equations:
                     raise ChapterError(chapter.path, line, f"a second equation is labelled {label!r}")
                 equations[label] = f"{chapter.number}.{len(equations) + 1}"
-    return kind(chapter.assignment, equations, References(sources.references), sources.pages)
+    return kind(chapter.assignment, equations, Bibliography(sources.bibliography), sources.pages)
 
 
 def _render(text: str, dialect: markdown.Dialect, chapter: Chapter, line: int) -> str:

@@ -12,7 +12,7 @@ from pybtex.plugin import find_plugin
 from pybtex.richtext import Text
 
 
-class References:
+class Bibliography:
     """The entries of one BibTeX file, read when first asked for. Unknown keys raise KeyError."""
 
     def __init__(self, path: Path) -> None:

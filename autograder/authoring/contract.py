@@ -30,7 +30,7 @@ class Sources:
 
     exercises: tuple[Exercise | Artefact, ...]
     solutions: ModuleType
-    references: Path
+    bibliography: Path
     pages: Mapping[int, str]  # the chapters that are written, and their pages' names
     elsewhere: Mapping[str, str] = field(default_factory=dict)  # the exercises of other chapters, and where they stand
 
@@ -57,7 +57,7 @@ def sources(chapter: Chapter) -> Sources:
     return Sources(
         checks.EXERCISES,
         _module(chapter, "solutions", "its reference functions"),
-        paths.REFERENCES,
+        paths.BIBLIOGRAPHY,
         {other.number: other.page for other in chapters},
         {
             str(cell.exercise): f"{_shown(other.path)}:{cell.line}"

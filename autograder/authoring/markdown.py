@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from string import ascii_uppercase
 
-from autograder.authoring.bibliography import References
+from autograder.authoring.bibliography import Bibliography
 
 ADMONITIONS = {"note": "Note", "tip": "Tip", "warning": "Warning", "important": "Important"}
 DIRECTIVES = {
@@ -104,8 +104,8 @@ class Choice:
 class Dialect(ABC):
     """How one kind of page writes what is not plain Markdown. `cited` collects the keys that a text cites, in order."""
 
-    def __init__(self, assignment: str, equations: Mapping[str, str], references: References, pages: Mapping[int, str]) -> None:
-        self.assignment, self.equations, self.references, self.pages = assignment, equations, references, pages
+    def __init__(self, assignment: str, equations: Mapping[str, str], works: Bibliography, pages: Mapping[int, str]) -> None:
+        self.assignment, self.equations, self.works, self.pages = assignment, equations, works, pages
         self.cited: dict[str, None] = {}
 
     def role(self, name: str, content: str, line: int) -> str:
@@ -118,9 +118,9 @@ class Dialect(ABC):
             return self.equation(content)
         keys = [key.strip() for key in content.split(",")]
         try:
-            text = self.references.cite(keys, parenthesised=name == "cite:p")
+            text = self.works.cite(keys, parenthesised=name == "cite:p")
         except KeyError as error:
-            raise MarkdownError(line, f"{error} is not in {self.references.path.name}") from error
+            raise MarkdownError(line, f"{error} is not in {self.works.path.name}") from error
         self.cited.update(dict.fromkeys(keys))
         return self.citation(name, keys, text)
 
@@ -239,7 +239,7 @@ class Plain(Dialect):
         return f"[{text}](../ch{number}/ch{number}.ipynb)" if number in self.pages else text
 
     def bibliography(self) -> str:
-        return self.references.listing(self.cited)
+        return self.works.listing(self.cited)
 
 
 def render(text: str, dialect: Dialect, line: int = 1) -> str:

@@ -78,7 +78,7 @@ def released(assignment: str) -> Released:
 @functools.cache
 def _released(assignment: str) -> Released:
     page = chapter.load(assignment)
-    outline = assemble.assignment(page)
+    outline = assemble.outline(page)
     exercises = tuple(
         artefacts.hidden(exercise) if isinstance(exercise, Artefact) else freeze.complete(exercise)
         for exercise in checks.exercises(assignment)
@@ -86,7 +86,7 @@ def _released(assignment: str) -> Released:
     names = {exercise.name for exercise in exercises}
     tests = {f"test_{name}" for name in names}
     questions = {name for name, _ in outline.open_questions}
-    live = [cell for cell in assemble.student_view(page).cells if cell.cell_type == "code" and is_live(cell)]
+    live = [cell for cell in assemble.for_learners(page).cells if cell.cell_type == "code" and is_live(cell)]
     return Released(
         assignment,
         exercises,

@@ -86,8 +86,8 @@ def staged_files(chapters: list[Chapter], with_solutions: bool) -> dict[str, byt
     files["_toc.yml"] = yaml.safe_dump(table_of_contents(chapters), sort_keys=False, allow_unicode=True).encode()
     for chapter in chapters:
         outputs = executed_outputs(chapter)
-        page = assemble.book_view(chapter, outputs, with_solutions=with_solutions)
-        student = assemble.student_view(chapter, outputs)
+        page = assemble.for_book(chapter, outputs, with_solutions=with_solutions)
+        student = assemble.for_learners(chapter, outputs)
         page.cells[
             0
         ].source += f"\n- **Notebook:** {{download}}`{chapter.assignment}.ipynb <downloads/{chapter.assignment}.ipynb>`"

@@ -65,7 +65,7 @@ def release(
     Raises: ValueError for an unknown chapter; ChapterError for a chapter that breaks its contract.
     """
     chosen = _chosen(only, directory)
-    notebooks = {_name(c): _bytes(assemble.student_view(c, recorded(c), sources(c))) for c in chosen}
+    notebooks = {_name(c): _bytes(assemble.for_learners(c, recorded(c), sources(c))) for c in chosen}
     support = {"README.md": _readme(chosen).encode(), **_library(chosen, sources)}
     before = _manifest(out)
     ours = before["notebooks"]
@@ -100,7 +100,7 @@ def write_nbgrader_course(
     nbgrader's own commands work there. It holds the solutions, and its hidden tests need this project installed.
     """
     for chapter in chapters_.all_chapters(chapters):
-        notebook = assemble.nbgrader_view(chapter, recorded(chapter), sources(chapter))
+        notebook = assemble.for_nbgrader(chapter, recorded(chapter), sources(chapter))
         _write(directory / "source" / _name(chapter), _bytes(notebook))
     _write(directory / "nbgrader_config.py", _NBGRADER_CONFIG.encode())
     return directory

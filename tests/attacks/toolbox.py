@@ -35,7 +35,7 @@ worker = type(channel).send.__globals__
 
 @functools.cache
 def _solved() -> NotebookNode:
-    notebook = assemble.student_view(chapter.load("ch44"))
+    notebook = assemble.for_learners(chapter.load("ch44"))
     for one in checks.exercises("ch44"):
         cell(notebook, one.name).source = inspect.getsource(one.reference)
     return notebook

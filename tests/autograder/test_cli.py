@@ -96,10 +96,10 @@ def run(variant, seed, checkpoint_dir, report):
 
 
 def test_long_runs_are_made_listed_and_kept(tmp_path, monkeypatch):
-    from experiments import runner
+    from experiments import campaign
 
     (tmp_path / "toy.py").write_text(TOY)
-    monkeypatch.setattr(runner, "FOLDER", tmp_path)
+    monkeypatch.setattr(campaign, "FOLDER", tmp_path)
     out = tmp_path / "runs"
     made = run("experiment", "toy", "--variant", "a", "--seeds", "1", "--out", out)
     assert made.exit_code == 0 and "toy: 1 made. The records are in" in made.output

@@ -70,7 +70,7 @@ def course(tiny, tmp_path_factory):
 def test_nbgraders_release_is_the_student_notebook(course, tiny):
     root, _ = course
     released = nbformat.read(root / "release" / "ch99" / "ch99.ipynb", as_version=4)
-    ours = assemble.student_view(tiny.chapter, tiny.outputs, tiny.sources(tiny.chapter))
+    ours = assemble.for_learners(tiny.chapter, tiny.outputs, tiny.sources(tiny.chapter))
     for cell in released.cells:
         cell.metadata.get("nbgrader", {}).pop("checksum", None)
     assert released.cells == ours.cells
@@ -85,8 +85,8 @@ def test_nbgrader_gives_the_reference_full_marks_the_stub_none_and_wrong_work_a_
     root, api = course
     sources = tiny.sources(tiny.chapter)
     _submit(root, "reference", nbformat.read(root / "source" / "ch99" / "ch99.ipynb", as_version=4))
-    _submit(root, "stub", assemble.student_view(tiny.chapter, tiny.outputs, sources))
-    _submit(root, "wrong", assemble.student_view(tiny.chapter, tiny.outputs, sources), WRONG)
+    _submit(root, "stub", assemble.for_learners(tiny.chapter, tiny.outputs, sources))
+    _submit(root, "wrong", assemble.for_learners(tiny.chapter, tiny.outputs, sources), WRONG)
     for student in ("reference", "stub", "wrong"):
         graded = api.autograde("ch99", student)
         assert graded["success"], graded["log"]

@@ -10,7 +10,7 @@ More words.
 import time
 
 from experiments import checkpoint
-from experiments.runner import Result
+from experiments.campaign import Result
 
 VARIANTS = {"fast": {"steps": 3}, "slow": {"steps": 40, "pause": 0.05}}
 SEEDS = {"fast": 2, "slow": 1}

@@ -96,7 +96,7 @@ def verdicts(tmp_path_factory):
     (folder / "submitted" / "ipython_everywhere" / "ch44" / "helpers.py").write_text("def keep(x):\n    return ~x\n")
     other = folder / "submitted" / "other_chapter" / "ch44"
     other.mkdir(parents=True)
-    toolbox.write(other, assemble.student_view(chapter.load("ch43")))
+    toolbox.write(other, assemble.for_learners(chapter.load("ch43")))
     options = ["--out", str(folder / "out"), "--jobs", "4", "--timeout", str(TIMEOUT)]
     process = subprocess.run(
         [sys.executable, "-m", "autograder", "grade", str(folder / "submitted"), *options],

@@ -20,7 +20,7 @@ def put(folder: Path, content: bytes | None = policy(), first: str = "", solved:
     `first` is a cell before all others; `double` is solved, if the chapter has it, unless not `solved`.
     """
     page = chapter.parse(next((course.HERE / "chapters").glob(f"{folder.name}_*.md")))
-    notebook = assemble.student_view(page, sources=course.sources(page))
+    notebook = assemble.for_learners(page, sources=course.sources(page))
     for cell in notebook.cells:
         if solved and cell.metadata.get("nbgrader", {}).get("grade_id") == "double":
             cell.source = "def double(x):\n    return x + x"

@@ -3,14 +3,14 @@ from pathlib import Path
 import pytest
 
 from autograder.authoring import markdown
-from autograder.authoring.bibliography import References
+from autograder.authoring.bibliography import Bibliography
 
-REFERENCES = References(Path(__file__).parents[1] / "fixtures" / "references.bib")
+BIBLIOGRAPHY = Bibliography(Path(__file__).parents[1] / "fixtures" / "references.bib")
 
 
 def _render(text, kind=markdown.Plain):
     equations = {label: f"44.{number}" for number, (label, _) in enumerate(markdown.labels(text), 1)}
-    return markdown.render(text, kind("ch44", equations, REFERENCES, {43: "ch43_ppo"}))
+    return markdown.render(text, kind("ch44", equations, BIBLIOGRAPHY, {43: "ch43_ppo"}))
 
 
 @pytest.mark.parametrize("kind", [markdown.Plain, markdown.Book])

@@ -136,7 +136,7 @@ def test_a_files_points_do_not_depend_on_the_graders_environment(folder, monkeyp
 
 def test_the_notebook_says_what_the_points_are_for_and_has_the_locked_check():
     assemble.verify(PAGE, SOURCES)
-    notebook = assemble.student_view(PAGE, sources=SOURCES)
+    notebook = assemble.for_learners(PAGE, sources=SOURCES)
     text = "\n".join(cell.source for cell in notebook.cells)
     assert "**4 points:** for the file `lander_policy.safetensors`, handed in beside the notebook." in text
     assert "no points up to a mean return of -400, all of them from 0 on" in text
@@ -144,7 +144,7 @@ def test_the_notebook_says_what_the_points_are_for_and_has_the_locked_check():
     assert graded["test_train"].source == "check(train)" and graded["test_train"].metadata.nbgrader.points == 4
     assert "NotImplementedError" in graded["train"].source
     assert "(5 points)" in notebook.cells[0].source
-    assert assemble.assignment(PAGE, SOURCES).exercises == (("double", 1.0), ("train", 4.0))
+    assert assemble.outline(PAGE, SOURCES).exercises == (("double", 1.0), ("train", 4.0))
 
 
 def test_the_bundle_has_the_visible_seeds_and_not_the_hidden_ones(tmp_path):
@@ -213,7 +213,7 @@ def test_nbgraders_hidden_line_pays_what_the_grader_pays(folder, monkeypatch):
     monkeypatch.setattr(hub.checks, "all_exercises", lambda: list(course.EXERCISES["ch97"]))
     hub._frozen.cache_clear()
     assert hub.score("train", train) == judged(folder)[0].score
-    source = assemble.nbgrader_view(PAGE, sources=SOURCES)
+    source = assemble.for_nbgrader(PAGE, sources=SOURCES)
     assert 'score("train", train)' in nbformat.writes(source).replace('\\"', '"')
 
 

@@ -9,12 +9,12 @@ import time
 import pytest
 
 from course_lib.figures import records
-from experiments import runner
-from experiments.runner import ExperimentError
+from experiments import campaign
+from experiments.campaign import ExperimentError
 
 
 def todo(folder, *variants, seeds=None):
-    return runner.tasks(runner.definition("toy", folder), variants, seeds, folder / "runs")
+    return campaign.tasks(campaign.definition("toy", folder), variants, seeds, folder / "runs")
 
 
 def ends(outcomes):
@@ -27,7 +27,7 @@ def steps(folder):
 
 def test_records_are_made_with_their_provenance_and_then_kept(folder):
     seen = []
-    outcomes = runner.make(todo(folder, "fast"), jobs=2, progress=lambda *message: seen.append(message))
+    outcomes = campaign.make(todo(folder, "fast"), jobs=2, progress=lambda *message: seen.append(message))
     assert ends(outcomes) == [("fast", 0, "made"), ("fast", 1, "made")]
     assert {message[:2] for message in seen} == {("fast", 0), ("fast", 1)} and ("fast", 1, 3, 3) in seen
     loaded = records.load("toy", folder / "runs")
@@ -39,48 +39,48 @@ def test_records_are_made_with_their_provenance_and_then_kept(folder):
     assert made["wall_seconds"] < 60 and made["versions"].keys() >= {"python", "torch"} and len(made["commit"]) >= 40
     assert made["machine"].keys() == {"cores", "memory_gb", "cpu"}
     assert not list((folder / "runs" / ".checkpoints").rglob("*.*")), "checkpoints of finished runs are gone"
-    assert ends(runner.make(todo(folder, "fast"))) == [("fast", 0, "kept"), ("fast", 1, "kept")]
+    assert ends(campaign.make(todo(folder, "fast"))) == [("fast", 0, "kept"), ("fast", 1, "kept")]
     assert len(steps(folder)) == 6
 
 
 def test_a_changed_configuration_and_a_damaged_file_are_made_again(folder):
-    list(runner.make(todo(folder, "fast")))
+    list(campaign.make(todo(folder, "fast")))
     records_of = [task.record for task in todo(folder, "fast")]
     records_of[0].write_bytes(b"damaged")
-    assert [runner.state(task) for task in todo(folder)] == ["damaged", "finished", "missing"]
+    assert [campaign.state(task) for task in todo(folder)] == ["damaged", "finished", "missing"]
     sys.modules.pop("experiments.toy")
     (folder / "toy.py").write_text((folder / "toy.py").read_text().replace('"steps": 3', '"steps": 2'))
-    assert [runner.state(task) for task in todo(folder, "fast")] == ["damaged", "outdated"]
-    assert ends(runner.make(todo(folder, "fast"))) == [("fast", 0, "made"), ("fast", 1, "made")]
+    assert [campaign.state(task) for task in todo(folder, "fast")] == ["damaged", "outdated"]
+    assert ends(campaign.make(todo(folder, "fast"))) == [("fast", 0, "made"), ("fast", 1, "made")]
     assert [len(records.read(path).columns["env_steps"]) for path in records_of] == [2, 2]
 
 
 def test_a_run_that_fails_tells_why_and_costs_the_others_nothing(folder):
     (folder / "fail").touch()
-    outcomes = list(runner.make(todo(folder, "fast", seeds=3)))
+    outcomes = list(campaign.make(todo(folder, "fast", seeds=3)))
     assert ends(outcomes) == [("fast", 0, "made"), ("fast", 1, "failed"), ("fast", 2, "made")]
     assert "RuntimeError: told to fail" in next(outcome.error for outcome in outcomes if outcome.state == "failed")
     (folder / "fail").unlink()
-    assert ends(runner.make(todo(folder, "fast"))) == [("fast", 0, "kept"), ("fast", 1, "made")]
+    assert ends(campaign.make(todo(folder, "fast"))) == [("fast", 0, "kept"), ("fast", 1, "made")]
 
 
 def test_a_run_that_another_process_makes_is_left_to_it(folder):
     (task,) = todo(folder, "fast", seeds=1)
     task.checkpoints.mkdir(parents=True)
-    with runner._lock(task.checkpoints / runner.LOCK):
-        assert runner.make_one(task, lambda *message: None).state == "busy"
-    assert runner.make_one(task, lambda *message: None).state == "made"
+    with campaign._lock(task.checkpoints / campaign.LOCK):
+        assert campaign.make_one(task, lambda *message: None).state == "busy"
+    assert campaign.make_one(task, lambda *message: None).state == "made"
 
 
 def test_after_kill_nine_the_next_command_goes_on_where_the_run_was(folder):
     program = (
-        "from pathlib import Path\nfrom experiments import runner\n"
+        "from pathlib import Path\nfrom experiments import campaign\n"
         "if __name__ == '__main__':\n"
         f"    folder = Path({str(folder)!r})\n"
-        "    list(runner.make(runner.tasks(runner.definition('toy', folder), ['slow'], None, folder / 'runs')))\n"
+        "    list(campaign.make(campaign.tasks(campaign.definition('toy', folder), ['slow'], None, folder / 'runs')))\n"
     )
     (folder / "main.py").write_text(program)
-    environment = os.environ | {"PYTHONPATH": str(runner.FOLDER.parent)}
+    environment = os.environ | {"PYTHONPATH": str(campaign.FOLDER.parent)}
     running = subprocess.Popen([sys.executable, folder / "main.py"], env=environment)
     try:
         _until(lambda: (folder / "steps.txt").exists() and len(steps(folder)) >= 5)
@@ -92,13 +92,13 @@ def test_after_kill_nine_the_next_command_goes_on_where_the_run_was(folder):
     _until(lambda: _free(task))  # the pool's process ends with its parent
     before = len(steps(folder))
     assert 5 <= before < 40
-    assert ends(runner.make([task])) == [("slow", 0, "made")]
+    assert ends(campaign.make([task])) == [("slow", 0, "made")]
     assert len(records.read(task.record).columns["env_steps"]) == 40
     assert len(steps(folder)) <= 41, "one step at most was taken twice"
 
 
 def _free(task):
-    with runner._lock(task.checkpoints / runner.LOCK) as ours:
+    with campaign._lock(task.checkpoints / campaign.LOCK) as ours:
         return ours
 
 
@@ -115,7 +115,7 @@ def test_dask_workers_make_the_same_records(folder):
     seen = []
     with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
         outcomes = list(
-            runner.make(todo(folder, "fast"), scheduler=cluster.scheduler_address, progress=lambda *m: seen.append(m))
+            campaign.make(todo(folder, "fast"), scheduler=cluster.scheduler_address, progress=lambda *m: seen.append(m))
         )
     assert ends(outcomes) == [("fast", 0, "made"), ("fast", 1, "made")]
     assert ("fast", 0, 3, 3) in seen
@@ -124,19 +124,19 @@ def test_dask_workers_make_the_same_records(folder):
 
 def test_bad_requests_are_refused(folder):
     with pytest.raises(ExperimentError, match="no experiment 'tow'; there are: toy"):
-        runner.definition("tow", folder)
+        campaign.definition("tow", folder)
     with pytest.raises(ExperimentError, match="toy has no variant 'quick'; it has: fast, slow"):
         todo(folder, "quick")
     with pytest.raises(ExperimentError, match="at least 1, got 0"):
         todo(folder, seeds=0)
     (folder / "half.py").write_text("VARIANTS = {}\nSEEDS = 1\n")
     with pytest.raises(ExperimentError, match=r"half.py must define run"):
-        runner.definition("half", folder)
+        campaign.definition("half", folder)
     (folder / "named.py").write_text("VARIANTS = {'a-b': {}}\nSEEDS = 1\ndef run(*args): ...\n")
     with pytest.raises(ExperimentError, match="got 'a-b'"):
-        runner.definition("named", folder)
+        campaign.definition("named", folder)
 
 
 def test_every_experiment_of_the_course_keeps_the_contract():
-    for name in runner.names():
-        assert runner.tasks(runner.definition(name))
+    for name in campaign.names():
+        assert campaign.tasks(campaign.definition(name))

@@ -43,7 +43,7 @@ from course_lib.figures import records
 
 FOLDER = Path(__file__).parent
 RUNS = FOLDER / "runs"
-NOT_EXPERIMENTS = {"__init__", "runner", "checkpoint", "snapshots"}
+NOT_EXPERIMENTS = {"__init__", "campaign", "checkpoint", "snapshots"}
 PACKAGES = ("torch", "numpy", "gymnasium", "Box2D", "mujoco", "transformers")  # what decides results, where installed
 LOCK, CLOCK = ".lock", ".seconds"
 
@@ -295,7 +295,7 @@ def _module(file: Path) -> ModuleType:
 def _validate(module: ModuleType, file: Path) -> None:
     for part, kind in (("VARIANTS", Mapping), ("SEEDS", (int, Mapping)), ("run", Callable)):
         if not isinstance(getattr(module, part, None), kind):  # type: ignore[arg-type]
-            raise ExperimentError(f"{file} must define {part}: see experiments/runner.py for the parts of an experiment")
+            raise ExperimentError(f"{file} must define {part}: see experiments/campaign.py for the parts of an experiment")
     for variant in module.VARIANTS:
         if not re.fullmatch(r"[A-Za-z0-9_.]+", variant):
             raise ExperimentError(f"{file}: a variant's name has letters, digits, '_' and '.', got {variant!r}")
