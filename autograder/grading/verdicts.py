@@ -140,7 +140,7 @@ class Verdict:
         return tuple(item for item in self.items if item.state != "manual")
 
 
-def to_json(verdict: Verdict | Mapping[str, Any]) -> str:
+def to_json(verdict: Verdict) -> str:
     """Strict JSON, the same text for the same verdict. Raises: ValueError past 1 MB."""
     text = json.dumps(asdict(Verdict.of(verdict)), sort_keys=True, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     if len(text.encode()) >= MAX_BYTES:
@@ -184,7 +184,7 @@ def write_atomically(path: Path, text: str) -> Path:
     return path
 
 
-def write(directory: Path, verdict: Verdict | Mapping[str, Any]) -> Path:
+def write(directory: Path, verdict: Verdict) -> Path:
     """Write the verdict to `directory/{student}/{assignment}.json`; `directory` is `DIR/verdicts`."""
     verdict = Verdict.of(verdict)
     return write_atomically(Path(directory) / verdict.student / f"{verdict.assignment}.json", to_json(verdict))

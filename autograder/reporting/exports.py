@@ -192,7 +192,7 @@ _OVERVIEW = ("Student", "Assignment", "Status", "Points", "Outcome")
 _STATUS_STYLES = {"graded": "green", "student_error": "red", "needs_review": "yellow", "infra_error": "bold red"}
 
 
-def table(verdicts: Iterable[Verdict | Mapping[str, Any]]) -> Table:
+def table(verdicts: Iterable[Verdict]) -> Table:
     """The verdicts for a terminal, one line each."""
     result = Table(*_OVERVIEW)
     result.columns[3].justify = "right"
@@ -217,7 +217,7 @@ def same_files(verdicts: Iterable[Verdict]) -> list[str]:
     ]
 
 
-def summary_markdown(verdicts: Iterable[Verdict | Mapping[str, Any]], rows: int = 1000) -> str:
+def summary_markdown(verdicts: Iterable[Verdict], rows: int = 1000) -> str:
     """The same for a CI step summary, at most `rows` lines, in GitHub's Markdown."""
     valid = [Verdict.of(verdict) for verdict in verdicts]
     counts = Counter(verdict.status.replace("_", " ") for verdict in valid)

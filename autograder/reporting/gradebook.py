@@ -9,7 +9,6 @@ which readers such as formgrader never block the writer; the log needs a local d
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +18,7 @@ import nbformat
 from alembic.config import Config
 from alembic.script import ScriptDirectory
 from nbformat import NotebookNode
-from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output, new_raw_cell
+from nbformat.v4 import new_notebook, new_output
 from nbgrader import utils
 from nbgrader.api import (
     Assignment,
@@ -41,6 +40,7 @@ from sqlalchemy import URL, and_, create_engine, delete, event, func, inspect, m
 from sqlalchemy.orm import Session, aliased
 
 from autograder.grading.verdicts import Item, Verdict, plain_name, write_atomically
+from autograder.reporting import passive
 
 COURSE = "default_course"  # nbgrader's own name for the course of a folder that names none
 BUSY_SECONDS = 60
@@ -70,7 +70,7 @@ def _is_open_question(cell: NotebookNode) -> bool:
 
 def _answer(notebook: NotebookNode | None, name: str) -> str | None:
     cell = graded_cells(notebook).get(name) if notebook else None
-    return _passive(cell.source).strip() if cell else None
+    return passive.text(cell.source).strip() if cell else None
 
 
 # --- the database ------------------------------------------------------------------------------------------------------------
@@ -196,9 +196,7 @@ class GradebookWriter:
                     db.execute(delete(Comment).filter_by(cell_id=old.id))
                 db.delete(old)
 
-    def record(
-        self, verdict: Verdict | Mapping[str, Any], submitted: NotebookNode | None = None, previous: NotebookNode | None = None
-    ) -> bool:
+    def record(self, verdict: Verdict, submitted: NotebookNode | None = None, previous: NotebookNode | None = None) -> bool:
         """Write the automatic scores of a verdict, in one transaction. Returns whether the verdict is one that may be written.
 
         `needs_review` and `infra_error` are not, nor is the `student_error` of an unknown assignment; that of a known one is zero
@@ -225,7 +223,7 @@ class GradebookWriter:
             )
             grades = _get_or_add_each(db, Grade, graded, paper)
             comments = _get_or_add_each(db, Comment, solved, paper)
-            released = {cell.name: _passive(cell.source).strip() for cell in sources}
+            released = {cell.name: passive.text(cell.source).strip() for cell in sources}
             for name, grade in grades.items():
                 if name in comments:
                     answer = _answer(submitted, name)
@@ -351,9 +349,7 @@ def read_autograded(directory: Path, student: str, assignment: str) -> NotebookN
     return nbformat.read(path, as_version=4) if path.is_file() else None
 
 
-def write_autograded(
-    directory: Path, release: NotebookNode, submitted: NotebookNode | None, verdict: Verdict | Mapping[str, Any]
-) -> Path | None:
+def write_autograded(directory: Path, release: NotebookNode, submitted: NotebookNode | None, verdict: Verdict) -> Path | None:
     """Write what formgrader and `generate_feedback` show of a verdict; None, and nothing, for one that is never recorded.
 
     These are the learner's cells in their order, with the release's metadata and locked sources, the outcome as output of each
@@ -366,7 +362,7 @@ def write_autograded(
     originals = graded_cells(release)
     untouched = {cell.source: cell for cell in release.cells}
     items = {f"test_{item.exercise}": item for item in verdict.automatic}
-    cells = [_harmless(cell, untouched) for cell in _in_order(release, submitted or release)]
+    cells = [passive.cell(cell, untouched) for cell in _in_order(release, submitted or release)]
     for number, cell in enumerate(cells):
         cell.id = f"cell-{number}"
         name = cell.metadata.get("nbgrader", {}).get("grade_id")
@@ -391,44 +387,6 @@ def _in_order(release: NotebookNode, submitted: NotebookNode) -> list[NotebookNo
             source = original.source if utils.is_locked(original) else source
         cells.append(NotebookNode(cell_type=kind, source=source, metadata=metadata, outputs=cell.get("outputs", [])))
     return cells + list(missing.values())
-
-
-# What Markdown or MathJax would turn into markup: a tag, a link (nbconvert lets javascript: links pass), an active TeX command.
-_ACTIVE = re.compile(r"<(?=[A-Za-z/!?])|\](?=[(:\[])|\\(?=href|require|style|class|cssId)")
-_BASE64 = re.compile(r"[A-Za-z0-9+/=\s]*")
-_OUTPUT_CHARACTERS = 10_000
-
-
-def _passive(markdown: str) -> str:
-    """The same text with a space wherever something active would begin; lone surrogates, which no file can hold, become "?"."""
-    return _ACTIVE.sub(lambda match: match[0] + " ", markdown).encode(errors="replace").decode()
-
-
-def _harmless(cell: NotebookNode, untouched: Mapping[str, NotebookNode]) -> NotebookNode:
-    """A fresh cell with the same text. A teacher reads it in a page that may change grades, so nothing in it may be active."""
-    metadata = NotebookNode(cell.metadata)
-    original: Mapping[str, Any] = untouched.get(cell.source, {})
-    if cell.cell_type == "code":
-        outputs = [kept for output in cell.get("outputs", []) if (kept := _harmless_output(output))]
-        return new_code_cell(cell.source, outputs=outputs, metadata=metadata)
-    source = cell.source if original else _passive(cell.source)
-    if cell.cell_type == "markdown":
-        pictures = {"attachments": original["attachments"]} if "attachments" in original else {}
-        return new_markdown_cell(source, metadata=metadata, **pictures)
-    return new_raw_cell(source, metadata=metadata)
-
-
-def _harmless_output(output: NotebookNode) -> NotebookNode | None:
-    if output.output_type == "stream":
-        return new_output("stream", name=output.name, text=output.text[:_OUTPUT_CHARACTERS])
-    if output.output_type == "error":
-        traceback = "\n".join(output.traceback)[:_OUTPUT_CHARACTERS]
-        return new_output("error", ename=output.ename, evalue=output.evalue, traceback=[traceback])
-    data = output.get("data", {})
-    kept = {kind: data[kind] for kind in ("image/png", "image/jpeg") if _BASE64.fullmatch(data.get(kind, "-"))}
-    if "text/plain" in data:
-        kept["text/plain"] = data["text/plain"][:_OUTPUT_CHARACTERS]
-    return new_output("display_data", data=kept) if kept else None
 
 
 def _outcome(item: Item | None, verdict: Verdict) -> list[NotebookNode]:

@@ -2,6 +2,8 @@
 
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
+from autograder.grading.verdicts import Verdict
+
 POINTS = {"compute_gae": 3.0, "td_residuals": 2.0}
 QUESTIONS = {"tradeoff": 2.0}
 QUESTION_TEXT = "Why not λ = 1?\n\n*Write your answer here.*"
@@ -38,7 +40,7 @@ def submission(answer="Bias.", **keywords):
 
 
 def verdict(student="s001", scores=None, status="graded", points=POINTS, message="", **changes):
-    """A verdict as the judge gives it: all right unless `scores` says otherwise."""
+    """The mapping of a verdict: all right unless `scores` says otherwise."""
     items = []
     for name, worth in points.items():
         score = worth if scores is None else scores.get(name, worth)
@@ -68,3 +70,8 @@ def verdict(student="s001", scores=None, status="graded", points=POINTS, message
         "environment": "e3b0c442",
     }
     return common | rest | changes
+
+
+def judged(*args, **changes):
+    """The verdict itself, as the judge gives it."""
+    return Verdict.of(verdict(*args, **changes))

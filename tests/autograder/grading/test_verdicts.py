@@ -2,7 +2,7 @@ import json
 import os
 
 import pytest
-from gradebook_samples import HOSTILE, verdict
+from gradebook_samples import HOSTILE, judged, verdict
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -48,7 +48,7 @@ def test_any_verdict_survives_strict_json(items, flags, manual):
 
 
 def test_the_file_has_exactly_the_keys_of_the_contract():
-    raw = json.loads(to_json(verdict()))
+    raw = json.loads(to_json(judged()))
     assert set(raw) == set(verdict())
     assert set(raw["items"][0]) == set(verdict()["items"][0])
 
@@ -77,11 +77,11 @@ def test_impossible_verdicts_are_refused(changes):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[]", "{}", "null", '{"schema": 1}', to_json(verdict())[:-40], to_json(verdict()).replace("5.0", "NaN")]
+    "text", ["", "[]", "{}", "null", '{"schema": 1}', to_json(judged())[:-40], to_json(judged()).replace("5.0", "NaN")]
 )
 def test_other_text_is_no_verdict(text):
     with pytest.raises(ValueError):
-        from_json(text) if text != to_json(verdict()) else None
+        from_json(text) if text != to_json(judged()) else None
 
 
 def test_a_verdict_built_in_code_is_cleaned_when_it_is_written(tmp_path):
@@ -91,7 +91,7 @@ def test_a_verdict_built_in_code_is_cleaned_when_it_is_written(tmp_path):
 
 @pytest.mark.parametrize("score", [-1.0, 99.0])
 def test_whatever_a_teacher_has_typed_is_kept(score):
-    assert from_json(to_json(verdict(manual_score=score))).manual_score == score
+    assert from_json(to_json(judged(manual_score=score))).manual_score == score
 
 
 def test_no_number_of_flags_makes_a_verdict_too_big():
@@ -104,7 +104,7 @@ def test_no_number_of_flags_makes_a_verdict_too_big():
 def test_a_verdict_past_a_megabyte_is_refused():
     item = Item("e", 0.0, 1.0, "wrong", (), "x" * 2048)
     with pytest.raises(ValueError, match="too many items"):
-        to_json(verdict(items=[item] * 500))
+        to_json(judged(items=[item] * 500))
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", ".hidden", "a/b", "a\nb", "a\x00b", "\udc80", "x" * 250, 7])
@@ -120,21 +120,21 @@ def test_odd_names_are_names(name):
 
 def test_verdicts_are_read_back_in_order_and_leftovers_ignored(tmp_path):
     for student in ("s2", "s10", "=1+1"):
-        verdicts.write(tmp_path, verdict(student))
+        verdicts.write(tmp_path, judged(student))
     (tmp_path / "s2" / ".abc.tmp").write_text("{")
     assert [one.student for one in verdicts.read_all(tmp_path)] == ["=1+1", "s10", "s2"]
     assert verdicts.read_all(tmp_path / "absent") == []
 
 
 def test_a_verdict_under_another_name_is_reported(tmp_path):
-    path = verdicts.write(tmp_path, verdict("s1"))
+    path = verdicts.write(tmp_path, judged("s1"))
     path.parent.rename(tmp_path / "s2")
     with pytest.raises(ValueError, match=r"s2/ch44\.json: it is the verdict of s1"):
         verdicts.read_all(tmp_path)
 
 
 def test_a_full_disk_keeps_the_old_verdict(tmp_path, monkeypatch):
-    path = verdicts.write(tmp_path, verdict())
+    path = verdicts.write(tmp_path, judged())
     before = path.read_text()
 
     def full(_descriptor):
@@ -142,6 +142,6 @@ def test_a_full_disk_keeps_the_old_verdict(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space"):
-        verdicts.write(tmp_path, verdict(scores={"compute_gae": 0.0}))
+        verdicts.write(tmp_path, judged(scores={"compute_gae": 0.0}))
     assert path.read_text() == before
     assert os.listdir(path.parent) == [path.name]

@@ -5,7 +5,7 @@ from html.parser import HTMLParser
 from xml.etree import ElementTree
 
 import pytest
-from gradebook_samples import HOSTILE, release, submission, verdict
+from gradebook_samples import HOSTILE, judged, release, submission, verdict
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
@@ -41,7 +41,7 @@ def every_state(**changes):
 
 def test_everything_is_written_for_odd_names_and_texts(writer, tmp_path):
     for student in ODD_STUDENTS:
-        result = verdict(student, {"compute_gae": 1.5}, message=HOSTILE)
+        result = judged(student, {"compute_gae": 1.5}, message=HOSTILE)
         writer.record(result, submission())
         verdicts.write(tmp_path / "verdicts", result)
     written = exports.write_all(tmp_path, writer)
@@ -64,10 +64,10 @@ def test_everything_is_written_for_odd_names_and_texts(writer, tmp_path):
 @pytest.mark.parametrize("graded_before", [True, False])
 def test_a_submission_without_a_final_verdict_has_neither_a_zero_nor_an_old_score(writer, tmp_path, status, graded_before):
     writer.register("ch45", release())
-    writer.record(verdict(assignment="ch45"))
+    writer.record(judged(assignment="ch45"))
     if graded_before:
-        writer.record(verdict())
-    verdicts.write(tmp_path / "verdicts", verdict(status=status))
+        writer.record(judged())
+    verdicts.write(tmp_path / "verdicts", judged(status=status))
     exports.write_all(tmp_path, writer)
     assert [(row["assignment"], row["score"]) for row in rows(tmp_path / "grades.csv")] == [("ch45", "5.0")]
     assert "ch44" not in rows(tmp_path / "canvas.csv")[1]
@@ -101,8 +101,8 @@ def test_no_csv_cell_is_a_formula(text, start):
 
 def test_canvas_has_points_possible_names_and_blanks(writer):
     writer.register("ch45", release())
-    writer.record(verdict("s001", {"compute_gae": 1.0}))
-    writer.record(verdict("s002", assignment="ch45"))
+    writer.record(judged("s001", {"compute_gae": 1.0}))
+    writer.record(judged("s002", assignment="ch45"))
     with writer._transaction() as db:
         from nbgrader.api import Student
 
@@ -197,7 +197,7 @@ def test_a_report_says_every_state_in_words():
 
 def test_terminal_table_shows_names_as_they_are():
     console = Console(file=io.StringIO(), width=200)
-    console.print(exports.table([verdict("[red]x"), verdict("s2", status="infra_error")]))
+    console.print(exports.table([judged("[red]x"), judged("s2", status="infra_error")]))
     text = console.file.getvalue()
     assert "[red]x" in text and "5 / 5" in text and "2 correct" in text and "infra error" in text
 
@@ -206,13 +206,13 @@ def test_terminal_table_says_why_a_submission_could_not_be_graded():
     console = Console(file=io.StringIO(), width=200)
     item = {"score": 0.0, "max_score": 1.0, "state": "error", "message": "There is no notebook."}
     items = [item | {"exercise": name} for name in ("first", "second")]
-    console.print(exports.table([verdict(status="student_error", score=0.0, items=items)]))
+    console.print(exports.table([judged(status="student_error", score=0.0, items=items)]))
     assert console.file.getvalue().count("There is no notebook.") == 1
 
 
 def test_summary_is_a_markdown_table_of_bounded_length():
-    text = exports.summary_markdown([verdict("a|b <img> _x_", flags=["`@all`\n| x"])])
+    text = exports.summary_markdown([judged("a|b <img> _x_", flags=["`@all`\n| x"])])
     assert text.startswith("**Submissions: 1** (1 graded)")
     assert text.splitlines()[-1].count("|") == 6
     assert not set(text.splitlines()[-1]) & set("<>`@_[]*")
-    assert len(exports.summary_markdown([verdict(f"s{n}") for n in range(5)], rows=2).splitlines()) == 8
+    assert len(exports.summary_markdown([judged(f"s{n}") for n in range(5)], rows=2).splitlines()) == 8

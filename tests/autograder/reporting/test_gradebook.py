@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 
 import nbformat
 import pytest
-from gradebook_samples import HOSTILE, POINTS, QUESTION_TEXT, release, submission, verdict
+from gradebook_samples import HOSTILE, POINTS, QUESTION_TEXT, judged, release, submission
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_output, new_raw_cell
 from nbgrader import utils
 from nbgrader.api import Gradebook
@@ -104,17 +104,17 @@ def test_the_database_is_stamped_as_nbgrader_stamps_it(url, writer, tmp_path):
 
 
 def test_changed_points_and_new_cells_reach_old_submissions(url, writer):
-    writer.record(verdict())
+    writer.record(judged())
     points = {"compute_gae": 4.0, "td_residuals": 2.0, "lambda_returns": 1.0}
     writer.register("ch44", release(points))
-    writer.record(verdict(points=points))
+    writer.record(judged(points=points))
     with stock(url) as book:
         assert book.find_assignment("ch44").max_score == 9.0
     assert total(url) == 7.0
 
 
 def test_a_withdrawn_cell_goes_unless_a_teacher_has_worked_on_it(url, writer):
-    writer.record(verdict())
+    writer.record(judged())
     writer.register("ch44", release({"compute_gae": 3.0}))
     assert set(facts(url)) == {"test_compute_gae", "tradeoff"}
     by_hand(url, "tradeoff", 1.5)
@@ -128,7 +128,7 @@ def test_a_withdrawn_cell_goes_unless_a_teacher_has_worked_on_it(url, writer):
 
 
 def test_recording_again_replaces_automatic_scores_only(url, writer):
-    writer.record(verdict(scores={"compute_gae": 1.5}), submission())
+    writer.record(judged(scores={"compute_gae": 1.5}), submission())
     assert facts(url) == {
         "test_compute_gae": (1.5, None, False),
         "test_td_residuals": (2.0, None, False),
@@ -140,7 +140,7 @@ def test_recording_again_replaces_automatic_scores_only(url, writer):
         comment.manual_comment = "Good."
         book.find_grade("test_td_residuals", "ch44", "ch44", "s001").extra_credit = 0.5
         book.update_or_create_student("s001", last_name="Noether", first_name="Emmy")
-    writer.record(verdict(), submission())
+    writer.record(judged(), submission())
     assert facts(url)["tradeoff"] == (None, 1.0, False)
     assert total(url) == 3.0 + 2.0 + 0.5 + 1.0
     with stock(url) as book:
@@ -153,39 +153,39 @@ def test_recording_the_same_twice_changes_nothing(url, writer, tmp_path):
         with contextlib.closing(sqlite3.connect(tmp_path / "gradebook.db")) as connection:
             return list(connection.iterdump())
 
-    writer.record(verdict(), submission())
+    writer.record(judged(), submission())
     before = dump()
     writer.register("ch44", release())
-    writer.record(verdict(), submission(), submission())
+    writer.record(judged(), submission(), submission())
     assert dump() == before
 
 
 def test_a_teacher_who_overruled_a_score_hears_when_it_changes(url, writer):
-    writer.record(verdict(scores={"compute_gae": 0.0}))
+    writer.record(judged(scores={"compute_gae": 0.0}))
     by_hand(url, "test_compute_gae", 2.0)
-    writer.record(verdict(scores={"compute_gae": 0.0}))
+    writer.record(judged(scores={"compute_gae": 0.0}))
     assert facts(url)["test_compute_gae"] == (0.0, 2.0, False)
-    writer.record(verdict())
+    writer.record(judged())
     assert facts(url)["test_compute_gae"] == (3.0, 2.0, True)
 
 
 def test_an_answer_that_changed_is_graded_again(url, writer):
-    writer.record(verdict(), submission())
+    writer.record(judged(), submission())
     by_hand(url, "tradeoff", 1.0)
-    writer.record(verdict(), submission(), previous=submission())
+    writer.record(judged(), submission(), previous=submission())
     assert facts(url)["tradeoff"] == (None, 1.0, False)
-    writer.record(verdict(), submission("Variance."), previous=submission())
+    writer.record(judged(), submission("Variance."), previous=submission())
     assert facts(url)["tradeoff"] == (None, 1.0, True)
     assert writer.manual_scores("s001", "ch44") == (1.0, 2.0)
 
 
 def test_a_question_left_as_released_waits_for_nobody(url, writer):
-    writer.record(verdict(), release())
+    writer.record(judged(), release())
     assert facts(url)["tradeoff"] == (0.0, None, False)
     assert writer.manual_scores("s001", "ch44") == (None, 2.0)
     with stock(url) as book:
         assert book.find_comment("tradeoff", "ch44", "ch44", "s001").comment == "No response."
-    writer.record(verdict(), submission(), previous=release())
+    writer.record(judged(), submission(), previous=release())
     assert facts(url)["tradeoff"] == (None, None, True)
     with stock(url) as book:
         assert book.find_comment("tradeoff", "ch44", "ch44", "s001").comment is None
@@ -197,7 +197,7 @@ def test_manual_scores_wait_for_every_answer(url):
         writer.register("ch44", release(questions=questions))
         assert writer.manual_scores("s001", "ch44") == (None, 3.0)
         assert writer.manual_scores("s001", "ch99") == (None, 0.0)
-        writer.record(verdict(), submission(questions=questions))
+        writer.record(judged(), submission(questions=questions))
         by_hand(url, "tradeoff", 1.5)
         assert writer.manual_scores("s001", "ch44") == (None, 3.0)
         by_hand(url, "why", 0.0)
@@ -206,29 +206,29 @@ def test_manual_scores_wait_for_every_answer(url):
 
 @pytest.mark.parametrize("status", ["needs_review", "infra_error"])
 def test_verdicts_without_a_final_score_are_not_written(url, writer, status):
-    assert not writer.record(verdict(status=status))
+    assert not writer.record(judged(status=status))
     with stock(url) as book:
         assert book.students == []
-    writer.record(verdict())
+    writer.record(judged())
     before = facts(url)
-    assert not writer.record(verdict(status=status, scores={"compute_gae": 0.0}))
+    assert not writer.record(judged(status=status, scores={"compute_gae": 0.0}))
     assert facts(url) == before
 
 
 def test_a_student_error_is_zero_and_keeps_scores_given_by_hand(url, writer):
-    writer.record(verdict(), submission())
+    writer.record(judged(), submission())
     by_hand(url, "tradeoff", 2.0)
-    assert writer.record(verdict(status="student_error", items=[], score=0.0))
+    assert writer.record(judged(status="student_error", items=[], score=0.0))
     assert facts(url)["test_compute_gae"] == (0.0, None, False)
     assert total(url) == 2.0
-    assert not writer.record(verdict(status="student_error", assignment="nonsense", items=[], score=0.0, max_score=0.0))
+    assert not writer.record(judged(status="student_error", assignment="nonsense", items=[], score=0.0, max_score=0.0))
 
 
 def test_what_cannot_be_recorded_is_an_error_and_leaves_no_trace(url, writer):
     with pytest.raises(ValueError, match="register"):
-        writer.record(verdict(assignment="ch45"))
+        writer.record(judged(assignment="ch45"))
     with pytest.raises(ValueError, match="td_residuals"):
-        writer.record(verdict(points={"compute_gae": 3.0}))
+        writer.record(judged(points={"compute_gae": 3.0}))
     with stock(url) as book:
         assert book.students == []
 
@@ -237,26 +237,26 @@ def test_what_cannot_be_recorded_is_an_error_and_leaves_no_trace(url, writer):
 
 
 def test_a_run_killed_inside_a_transaction_leaves_the_previous_scores(url, writer, monkeypatch):
-    writer.record(verdict(scores={"compute_gae": 0.0}))
+    writer.record(judged(scores={"compute_gae": 0.0}))
     before = facts(url)
 
     def killed():
         with GradebookWriter(url) as mine:
             monkeypatch.setattr(gradebook, "_grade_question", lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL))
-            mine.record(verdict())
+            mine.record(judged())
 
     assert in_child(killed)() == -signal.SIGKILL
     assert facts(url) == before
-    writer.record(verdict())
+    writer.record(judged())
     assert facts(url)["test_compute_gae"] == (3.0, None, False)
 
 
 def test_a_run_killed_between_gradebook_and_notebook_converges(url, writer, tmp_path):
     def run(answer, killed=False):
         submitted = submission(answer)
-        writer.record(verdict(), submitted, read_autograded(tmp_path, "s001", "ch44"))
+        writer.record(judged(), submitted, read_autograded(tmp_path, "s001", "ch44"))
         if not killed:
-            write_autograded(tmp_path, release(), submitted, verdict())
+            write_autograded(tmp_path, release(), submitted, judged())
 
     run("First.")
     by_hand(url, "tradeoff", 1.0)
@@ -271,7 +271,7 @@ def test_processes_that_start_and_write_at_once_lose_nothing(url):
         with GradebookWriter(url) as mine:
             mine.register("ch44", release())
             for number in range(offset, offset + 15):
-                mine.record(verdict(f"s{number:03}"), submission())
+                mine.record(judged(f"s{number:03}"), submission())
 
     waits = [in_child(lambda offset=offset: work(offset)) for offset in (0, 10, 20)]  # overlapping: some are written twice
     assert [wait() for wait in waits] == [0, 0, 0]
@@ -280,10 +280,10 @@ def test_processes_that_start_and_write_at_once_lose_nothing(url):
 
 
 def test_a_reader_is_never_in_the_way(url, writer):
-    writer.record(verdict("s001"))
+    writer.record(judged("s001"))
     with stock(url) as reader:
         assert reader.find_submission("ch44", "s001").score == 5.0  # its transaction stays open
-        writer.record(verdict("s002"))
+        writer.record(judged("s002"))
     assert total(url, "s002") == 5.0
 
 
@@ -337,7 +337,7 @@ def test_nbgraders_own_tools_work_on_the_folder(url, writer, tmp_path):
         ("s003", None, {}),
     ):
         status = "graded" if notebook else "student_error"
-        result = verdict(student, scores, status, message=HOSTILE)
+        result = judged(student, scores, status, message=HOSTILE)
         writer.record(result, notebook)
         write_autograded(tmp_path, release(), notebook, result)
     arguments = [sys.executable, "-m", "nbgrader", "generate_feedback", "ch44"]
@@ -356,7 +356,7 @@ def test_the_shown_notebook_says_what_the_gradebook_says(url, writer, tmp_path):
     """nbgrader's own determine_grade, which SaveAutoGrades uses, finds the recorded scores in the outputs."""
     for scores in ({}, {"compute_gae": 1.5}, {"compute_gae": 0.0, "td_residuals": 0.0}):
         for notebook in (submission(), hostile_submission()):
-            result = verdict(scores=scores, message="Look at\nthe mask.")
+            result = judged(scores=scores, message="Look at\nthe mask.")
             writer.record(result, notebook)
             shown = nbformat.read(write_autograded(tmp_path, release(), notebook, result), as_version=4)
             nbformat.validate(shown)
@@ -369,7 +369,7 @@ def test_the_shown_notebook_says_what_the_gradebook_says(url, writer, tmp_path):
 
 
 def test_a_verdict_that_is_not_recorded_is_not_shown(tmp_path):
-    assert write_autograded(tmp_path, release(), submission(), verdict(status="needs_review")) is None
+    assert write_autograded(tmp_path, release(), submission(), judged(status="needs_review")) is None
     assert read_autograded(tmp_path, "s001", "ch44") is None
 
 
@@ -386,8 +386,8 @@ def test_the_course_folder_never_holds_a_password(tmp_path):
 def test_grades_csv_is_nbgraders_export(url, writer, tmp_path):
     writer.register("ch45", release(POINTS))
     for student in ("s001", "s002"):
-        writer.record(verdict(student, {"compute_gae": 1.0}))
-    writer.record(verdict("s001", assignment="ch45"))
+        writer.record(judged(student, {"compute_gae": 1.0}))
+    writer.record(judged("s001", assignment="ch45"))
     by_hand(url, "tradeoff", 1.25)
     with stock(url) as book:
         book.update_or_create_student("s001", last_name="Noether", email="emmy@example.org")
