@@ -51,12 +51,13 @@ class Reference:
 def sources(chapter: Chapter) -> Sources:
     """The real sources of a chapter of this checkout. ChapterError if its checks or its solutions are missing."""
     chapters = all_chapters()
+    solutions = _module(chapter, "solutions", "its reference functions")  # first, as the checks import them
     checks = _module(chapter, "checks", "a tuple `EXERCISES`")
     if not hasattr(checks, "EXERCISES"):
         raise ChapterError(Path(str(checks.__file__)), 1, "a chapter's checks are its tuple `EXERCISES`, which is missing here")
     return Sources(
         checks.EXERCISES,
-        _module(chapter, "solutions", "its reference functions"),
+        solutions,
         paths.BIBLIOGRAPHY,
         {other.number: other.page for other in chapters},
         {

@@ -119,16 +119,25 @@ def test_a_slip_ends_verification_with_file_and_line():
 
 def test_a_chapter_without_checks_or_solutions_is_told_which_file_to_write(tiny, monkeypatch):
     with pytest.raises(
+        ChapterError, match=r"ch99_tiny.md:\d+: there is no solutions/ch99\.py, and so no solutions of double: write it"
+    ):
+        contract.sources(tiny.chapter)
+    monkeypatch.setitem(sys.modules, "solutions.ch99", checks)
+    with pytest.raises(
         ChapterError, match=r"ch99_tiny.md:\d+: there is no autograder/checks/ch99\.py, and so no checks of double: write"
     ):
         contract.sources(tiny.chapter)
     monkeypatch.setitem(sys.modules, "autograder.checks.ch99", checks)
     with pytest.raises(ChapterError, match=r"checks/__init__.py:1: .*`EXERCISES`"):
         contract.sources(tiny.chapter)
-    monkeypatch.setattr(checks, "EXERCISES", (), raising=False)
-    with pytest.raises(
-        ChapterError, match=r"there is no solutions/ch99\.py, and so no solutions of double: write it, with its reference"
-    ):
+
+
+def test_a_module_that_is_there_and_imports_something_that_is_not_keeps_its_own_error(tiny, monkeypatch):
+    def broken(name):
+        raise ModuleNotFoundError("No module named 'numpi'", name="numpi")
+
+    monkeypatch.setattr(contract.importlib, "import_module", broken)
+    with pytest.raises(ModuleNotFoundError, match="numpi"):
         contract.sources(tiny.chapter)
 
 
