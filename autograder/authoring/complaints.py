@@ -6,6 +6,7 @@ Only the inputs of the cases are drawn. Each complaint is one sentence that name
 from __future__ import annotations
 
 import difflib
+import importlib
 import inspect
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
@@ -46,6 +47,24 @@ def of_view(exercise: Exercise, case: Case) -> Iterator[str]:
     if case.view and not hasattr(views, case.view):
         place = f"{exercise.name}, case {case.name!r}"
         yield f"{place}: there is no view {case.view!r}{_or(case.view, vars(views))}; views are functions of course_lib/checks/views.py"
+
+
+def of_built(exercise: Exercise, case: Case, arguments: Any) -> Iterator[str]:
+    """Objects to be built that course_lib has not. Not part of `of_case`, as `of_view` is not."""
+    if isinstance(arguments, Mapping):
+        if "@built" in arguments:
+            module, _, maker = str(arguments["@built"]).rpartition(".")
+            try:
+                known = hasattr(importlib.import_module(f"course_lib.{module}"), maker)
+            except ModuleNotFoundError:
+                known = False
+            if not known:
+                place = f"{exercise.name}, case {case.name!r}"
+                yield f"{place}: course_lib has no {arguments['@built']}, which `built` is to make; it takes module.name"
+        arguments = list(arguments.values())
+    if isinstance(arguments, list):
+        for entry in arguments:
+            yield from of_built(exercise, case, entry)
 
 
 def checks_file(exercise: Exercise) -> Path | None:

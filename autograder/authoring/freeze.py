@@ -40,6 +40,7 @@ def refusals(exercise: Exercise) -> Iterator[str]:
             yield f"{exercise.name}, case {case.name!r}: no inputs can be drawn, {type(error).__name__}: {error}"
         else:
             yield from complaints.of_case(exercise, case, arguments)
+            yield from complaints.of_built(exercise, case, arguments)
 
 
 def visible(exercise: Exercise, seed: int = 0) -> FrozenExercise:

@@ -10,6 +10,7 @@ from autograder import checks, paths
 from autograder.authoring import assemble, chapter, complaints, contract, freeze
 from autograder.authoring.chapter import ChapterError
 from autograder.authoring.spec import Case, Exercise
+from course_lib.checks.cases import built
 
 
 def discounted(rewards, gamma, gae_lambda=0.5):
@@ -58,6 +59,16 @@ SLIPS = [
         " views are functions of course_lib/checks/views.py",
     ),
 ]
+
+
+@pytest.mark.parametrize("maker", ["seeding.generater", "envs.TimerVectorEnv", "generator"])
+def test_something_to_be_built_that_the_library_has_not_is_told(maker):
+    case = Case(
+        "made", lambda draws: rewards(draws) | {"gae_lambda": [{"inner": built(maker, seed=built("seeding.generator", seed=1))}]}
+    )
+    assert list(freeze.refusals(exercise(case))) == [
+        f"discounted, case 'made': course_lib has no {maker}, which `built` is to make; it takes module.name"
+    ]
 
 
 @pytest.mark.parametrize(("case", "sentence"), SLIPS, ids=[case.name for case, _ in SLIPS])
