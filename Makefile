@@ -1,4 +1,5 @@
 # make book    build book/_build/html/index.html          make test   all tests (installs Chromium and bubblewrap if it may)
+# make test ONLY=ch44    one chapter all the way, in about a minute
 # make release write the students' bundle into release/   make check  style, types and the quick tests
 # make bench   how fast are the grader, beside stock nbgrader, PPO and SAC, beside Stable-Baselines3, and DPO, beside TRL (installs both)
 # The environment is .venv; it is brought up to date whenever the pins or pyproject.toml change.
@@ -9,7 +10,9 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 WHOLE_MACHINE := tests/e2e tests/field tests/attacks tests/faults # they grade with a job for each core, under short time limits
 TWO_AT_A_TIME := $(WHOLE_MACHINE:%=--ignore=%)
-FILE_BY_FILE := -n 2 --dist loadfile --no-loadscope-reorder # sorted by the number of tests, the longest files would come last
+IN_GROUPS := -n 2 --dist loadgroup --no-loadscope-reorder # tests/groups.py says which, and puts the longest first
+ONE_CHAPTER = tests/solutions/test_$(ONLY).py tests/autograder/authoring/test_contract.py tests/autograder/proving/test_killmatrix.py \
+  tests/autograder/publishing/test_release.py tests/book/test_pages.py tests/book/test_widgets.py tests/e2e/test_every_answer.py
 QUICK := $(TWO_AT_A_TIME) --ignore=tests/book --ignore=tests/autograder/proving/test_killmatrix.py
 
 .PHONY: book release test check bench install clean
@@ -20,12 +23,18 @@ book: install
 release: install
 	$(BIN)/course release
 
+ifdef ONLY
+test: install
+	tools/system-packages
+	$(BIN)/python -m pytest -q $(IN_GROUPS) --only $(ONLY) $(ONE_CHAPTER)
+else
 test: install
 	tools/system-packages
 	status=0; \
-	$(BIN)/python -m pytest $(FILE_BY_FILE) $(TWO_AT_A_TIME) || status=1; \
+	$(BIN)/python -m pytest $(IN_GROUPS) $(TWO_AT_A_TIME) || status=1; \
 	$(BIN)/python -m pytest $(WHOLE_MACHINE) || status=1; \
 	exit $$status
+endif
 
 check: install
 	$(BIN)/ruff check

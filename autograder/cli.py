@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 from rich.console import Console
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
     from autograder.authoring.chapter import Chapter
 
 # Each command imports what it needs: torch, nbgrader and Sphinx cost seconds, and `course --help` should not.
+
+# jsonschema, which reads notebooks, would make a parser of web addresses, for two seconds; it does without, as do notebooks.
+sys.modules.setdefault("rfc3987_syntax", cast(ModuleType, None))
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, help=__doc__)
 OK, LOW_SCORES, BAD_INPUT, BROKEN = 0, 1, 2, 3
@@ -47,6 +51,39 @@ def book(
         print(f"The book is at {builder.build(with_solutions=not without_solutions) / 'index.html'}")
     except (builder.BookError, ValueError) as error:
         _stop(error, 1)
+
+
+@app.command()
+def page(
+    name: Annotated[str, typer.Argument(metavar="CHAPTER", help="As in ch44.")],
+    without_solutions: Annotated[
+        bool, typer.Option("--without-solutions", help="Leave the folded reference solutions out.")
+    ] = False,
+) -> None:
+    """Build the page of one chapter, into book/_build/page, and say which file to open: for whoever writes it."""
+    from autograder.publishing import page as builder
+    from autograder.publishing.execution import BookError
+
+    try:
+        print(f"The page is at {builder.shown(builder.build(name, with_solutions=not without_solutions))}")
+    except (BookError, ValueError) as error:
+        _stop(error, 1)
+
+
+@app.command()
+def new(
+    number: Annotated[int, typer.Argument(min=1, help="The chapter's number.")],
+    title: Annotated[str, typer.Argument(help="Its title.")],
+    exercises: Annotated[list[str], typer.Argument(help="The names of its functions.")],
+) -> None:
+    """Begin a chapter: solutions, checks, page and tests, with TODO wherever something is missing. Nothing is overwritten."""
+    from autograder.authoring import skeleton
+
+    try:
+        for path in skeleton.write(number, title, exercises):
+            print(os.path.relpath(path))
+    except (ValueError, OSError) as error:
+        _stop(error)
 
 
 @app.command()

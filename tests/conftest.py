@@ -9,9 +9,55 @@ from pathlib import Path
 
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parents[1]))  # wherever pytest is started
+
+from tests.groups import group_of, is_about, weight
+
 os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 
 os.environ.setdefault("COURSE_SEED", f"{date.today():%Y%m%d}")  # before xdist starts its workers, which inherit it
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--only", metavar="CHAPTER", help="what is about this chapter alone, as in --only ch44, with its page for the book"
+    )
+
+
+def pytest_configure(config):
+    if (only := config.getoption("--only")) is not None:
+        from autograder.authoring import chapter
+
+        try:
+            chapter.load(only)
+        except chapter.ChapterError:
+            pass  # for its tests to tell
+        except ValueError as error:
+            raise pytest.UsageError(f"--only: {error}") from error
+        os.environ["COURSE_ONLY"] = only  # for the workers, and for what is parametrised with one chapter
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """For --dist loadgroup. xdist 3.8 writes the marks of groups into ids, where pytest 9.2 does not look: so groups follow from ids."""
+    if config.getoption("dist") != "loadgroup":
+        return None
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByGroup(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            return group_of(nodeid)
+
+    return ByGroup(config, log)
+
+
+def pytest_collection_modifyitems(config, items):
+    """Keep what is about one chapter, if one is asked for; the longest groups first."""
+    if only := config.getoption("--only"):
+        others = [item for item in items if not is_about(item, only)]
+        config.hook.pytest_deselected(items=others)
+        items[:] = [item for item in items if is_about(item, only)]
+    items.sort(key=lambda item: -weight(group_of(item.nodeid)))  # the order within a group stays
 
 
 def pytest_report_header():

@@ -16,6 +16,7 @@ import yaml
 from jupytext.myst import MystMetadataParsingError, myst_to_notebook
 
 from autograder import paths
+from autograder.authoring import skeleton
 
 ANSWER_LINE = "*Write your answer here.*"
 
@@ -143,6 +144,11 @@ def all_chapters(directory: Path | None = None) -> list[Chapter]:
     return [parse(path) for path in _sources(directory).values()]
 
 
+def page_names(directory: Path | None = None) -> dict[int, str]:
+    """The pages of all chapters by number, `{44: "ch44_gae"}`, from the names of their files: none is read."""
+    return {int(assignment.removeprefix("ch")): path.stem for assignment, path in _sources(directory).items()}
+
+
 def _sources(directory: Path | None) -> dict[str, Path]:
     directory = directory or paths.checkout() / "chapters"
     found: dict[int, Path] = {}
@@ -196,7 +202,13 @@ def _cell(path: Path, cell: Any, start: int, lines: list[str]) -> Cell:
             _stub_options(path, start, tags, options)
         elif options.keys() & {"difficulty", "minutes"}:
             raise ChapterError(path, start, "difficulty and minutes belong to a cell with the option `exercise`")
-        return Cell("code", cell.source, start, tags, **options)
+        source = cell.source
+        if "exercise" in options and not source.strip():
+            try:
+                source = skeleton.stub(paths.ROOT / "solutions" / f"{path.name.partition('_')[0]}.py", options["exercise"])
+            except ValueError as error:
+                raise ChapterError(path, start, f"the stub is empty, to be made from its reference, but {error}") from error
+        return Cell("code", source, start, tags, **options)
     if cell.cell_type != "markdown":
         raise ChapterError(path, start, f"a {cell.cell_type} cell is not used here")
     while not lines[start].strip():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import builtins
+import functools
 import importlib
 import inspect
 import re
@@ -16,7 +17,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Literal
 
 from autograder import paths
-from autograder.authoring.chapter import Cell, Chapter, ChapterError, all_chapters
+from autograder.authoring.chapter import Cell, Chapter, ChapterError, page_names, parse
 
 if TYPE_CHECKING:
     from autograder.authoring.spec import Artefact, Exercise
@@ -50,7 +51,7 @@ class Reference:
 
 def sources(chapter: Chapter) -> Sources:
     """The real sources of a chapter of this checkout. ChapterError if its checks or its solutions are missing."""
-    chapters = all_chapters()
+    pages = page_names()
     solutions = _module(chapter, "solutions", "its reference functions")  # first, as the checks import them
     checks = _module(chapter, "checks", "a tuple `EXERCISES`")
     if not hasattr(checks, "EXERCISES"):
@@ -59,14 +60,20 @@ def sources(chapter: Chapter) -> Sources:
         checks.EXERCISES,
         solutions,
         paths.BIBLIOGRAPHY,
-        {other.number: other.page for other in chapters},
+        pages,
         {
-            str(cell.exercise): f"{_shown(other.path)}:{cell.line}"
-            for other in chapters
-            if other.number != chapter.number
-            for cell in other.exercises
+            name: place
+            for number, page in pages.items()
+            if number != chapter.number
+            for name, place in _exercises_of(path := paths.CHAPTERS / f"{page}.md", path.stat().st_mtime_ns)
         },
     )
+
+
+@functools.cache  # for as long as the file is the same: a build asks for the sources of each chapter several times
+def _exercises_of(path: Path, _modified: int) -> tuple[tuple[str, str], ...]:
+    """Name and place of each exercise of a chapter."""
+    return tuple((str(cell.exercise), f"{_shown(path)}:{cell.line}") for cell in parse(path).exercises)
 
 
 def _module(chapter: Chapter, kind: Literal["checks", "solutions"], contents: str) -> ModuleType:

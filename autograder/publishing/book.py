@@ -31,6 +31,7 @@ from autograder.paths import ROOT
 from autograder.proving.locks import one_at_a_time
 from autograder.publishing.execution import BookError, cache_folder, content_hash, executed_outputs, execution_key, run_all
 from autograder.publishing.format_page import format_page
+from autograder.publishing.located import relocated
 
 if TYPE_CHECKING:
     from autograder.proving.kept import Keys
@@ -38,6 +39,13 @@ if TYPE_CHECKING:
 BOOK = ROOT / "book"
 STAGE = BOOK / "_stage"
 PUBLISHED = ("*.html", "searchindex.js", "_static/*", "_images/*", "_downloads/*")
+JUPYTER_BOOK = """
+import json, sys
+sys.modules["rfc3987_syntax"] = None  # as in autograder.cli
+import jupyter_book.sphinx, myst_nb.sphinx_ext, sphinx_book_theme, sphinxcontrib.bibtex
+from jupyter_book.cli.main import main
+main(json.loads(sys.stdin.read()))
+"""
 HOW_TO = ("how-to/learners", "how-to/teachers", "how-to/contributors")
 MATHJAX = ("tex-chtml-full.js", "output/chtml/fonts/**/*", "a11y/*", "sre/**/*")
 
@@ -58,17 +66,22 @@ def build(with_solutions: bool = True, out: Path | None = None) -> Path:
         if _is_current(out, key):
             print(f"{out}: nothing has changed since it was built, so nothing was done")
             return out
-        for chapter in chapters:
-            assemble.verify(chapter)  # first, so that a slip in the prose is not found after minutes of running code
-        run_all(chapters)
         variant = "solved" if with_solutions else "unsolved"
         stage, work = STAGE / variant, cache_folder() / f"sphinx-{variant}"
-        if sync(staged_files(chapters, with_solutions), stage):
-            shutil.rmtree(work, ignore_errors=True)  # Sphinx never deletes the page of a source that has gone
-        _render(stage, work)
-        _publish(work / "_build" / "html", out)
+        with Renderer() as renderer:
+            run_all(chapters, first=lambda: _verify_all(chapters))
+            if sync(staged_files(chapters, with_solutions), stage):
+                shutil.rmtree(work, ignore_errors=True)  # Sphinx never deletes the page of a source that has gone
+            renderer.render(stage, work, chapters)
+        publish(work / "_build" / "html", out)
         _seal_path(out).write_text(json.dumps({"key": key, "files": _listing(out)}), encoding="utf-8")
     return out
+
+
+def _verify_all(chapters: list[Chapter]) -> None:
+    """Find a slip in the prose before minutes of running code; where nothing is run, staging finds it."""
+    for chapter in chapters:
+        assemble.verify(chapter)
 
 
 # ---- stage ----------------------------------------------------------------------------------------------------------
@@ -85,20 +98,23 @@ def staged_files(chapters: list[Chapter], with_solutions: bool) -> dict[str, byt
     files["format.md"] = format_page().encode()
     files["_toc.yml"] = yaml.safe_dump(table_of_contents(chapters), sort_keys=False, allow_unicode=True).encode()
     for chapter in chapters:
-        outputs = executed_outputs(chapter)
-        page = assemble.for_book(chapter, outputs, with_solutions=with_solutions)
-        student = assemble.for_learners(chapter, outputs)
-        page.cells[
-            0
-        ].source += f"\n- **Notebook:** {{download}}`{chapter.assignment}.ipynb <downloads/{chapter.assignment}.ipynb>`"
-        files[f"{docname(chapter)}.ipynb"] = nbformat.writes(page).encode()
-        files[f"chapters/downloads/{chapter.assignment}.ipynb"] = nbformat.writes(student).encode()
+        files |= staged_chapter(chapter, executed_outputs(chapter), with_solutions)
     keys = kept.Keys()
     matrix = {
         f"{chapter.number}. {chapter.title}": kill_rows(chapter, keys) for chapter in chapters
     }  # recorded, never drawn here
     files["kill-matrix.md"] = kill_matrix_page(matrix).encode()
-    return files | _assets()
+    return files | assets()
+
+
+def staged_chapter(chapter: Chapter, outputs: assemble.Outputs, with_solutions: bool) -> dict[str, bytes]:
+    """A chapter as Sphinx reads it, and the learners' notebook that its page offers."""
+    page = assemble.for_book(chapter, outputs, with_solutions=with_solutions)
+    student = assemble.for_learners(chapter, outputs)
+    name = f"{chapter.assignment}.ipynb"
+    page.cells[0].source += f"\n- **Notebook:** {{download}}`{name} <downloads/{name}>`"
+    files = {f"{docname(chapter)}.ipynb": page, f"chapters/downloads/{name}": student}
+    return {path: nbformat.writes(notebook).encode() for path, notebook in files.items()}
 
 
 def docname(chapter: Chapter) -> str:
@@ -214,7 +230,7 @@ def _front_page(text: str, chapters: list[Chapter]) -> str:
     return text.replace("<!-- chapters -->", "\n".join(entries))
 
 
-def _assets() -> dict[str, bytes]:
+def assets() -> dict[str, bytes]:
     """Our style sheet and scripts, and MathJax from its package, under a name other than _static, which Jupyter Book treats specially."""
     files = {f"vendor/{path.name}": path.read_bytes() for path in (BOOK / "static").iterdir() if path.suffix in (".css", ".js")}
     package = importlib.util.find_spec("sphinx-mathjax-offline")  # a name that no import statement can spell
@@ -244,19 +260,41 @@ def sync(files: dict[str, bytes], folder: Path) -> bool:
 # ---- render and publish ---------------------------------------------------------------------------------------------
 
 
-def _render(stage: Path, work: Path) -> None:
-    """Run Jupyter Book in a process of its own: Sphinx would keep global state in ours."""
-    book = [sys.executable, "-c", "from jupyter_book.cli.main import main; main()", "build", str(stage)]
-    options = ["--config", str(ROOT / "_config.yml"), "--path-output", str(work), "-W", "-n", "--keep-going", "-q"]
-    finished = subprocess.run(book + options, cwd=ROOT, capture_output=True, text=True, env=os.environ | {"NO_COLOR": "1"})
-    if finished.returncode != 0:
-        shutil.rmtree(work, ignore_errors=True)  # Sphinx would not repeat a warning about a page that it has read already
-        reasons = finished.stderr.partition("Traceback (most recent call last)")[0].strip() or finished.stderr
-        reasons = reasons.replace(f"{stage}/", "")
-        raise BookError(f"Jupyter Book warned or failed; the published book is unchanged.\n{reasons}")
+class Renderer:
+    """Jupyter Book in a process of its own, as Sphinx would keep global state in ours. It loads at once, and then waits for a stage."""
+
+    def __init__(self) -> None:
+        command = [sys.executable, "-c", JUPYTER_BOOK]
+        self._process = subprocess.Popen(
+            command,
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"NO_COLOR": "1"},
+        )
+
+    def render(self, stage: Path, work: Path, chapters: list[Chapter]) -> None:
+        """Build `stage` into `work`. Raises: BookError with every warning, told of the sources of these chapters."""
+        options = ["--config", str(ROOT / "_config.yml"), "--path-output", str(work), "-W", "-n", "--keep-going", "-q"]
+        _, complaints = self._process.communicate(json.dumps(["build", str(stage), *options]))
+        if self._process.returncode != 0:
+            shutil.rmtree(work, ignore_errors=True)  # Sphinx would not repeat a warning about a page that it has read already
+            reasons = complaints.partition("Traceback (most recent call last)")[0].strip() or complaints
+            told = relocated(reasons, stage, {docname(chapter): chapter for chapter in chapters})
+            raise BookError(f"Jupyter Book warned or failed; nothing was published.\n{told}")
+
+    def __enter__(self) -> Renderer:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._process.returncode is None:
+            self._process.kill()
+            self._process.communicate()
 
 
-def _publish(html: Path, out: Path) -> None:
+def publish(html: Path, out: Path) -> None:
     """Copy what is meant to be read beside `out`, then swap the folders."""
     fresh, former = out.with_name(out.name + ".new"), out.with_name(out.name + ".old")
     shutil.rmtree(fresh, ignore_errors=True)

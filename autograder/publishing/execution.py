@@ -8,6 +8,7 @@ kernel) ends the build with a BookError that names the chapter's file and line. 
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import os
@@ -16,7 +17,7 @@ import resource
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,8 +34,7 @@ from autograder.authoring.assemble import wordless
 from autograder.authoring.chapter import Cell, Chapter
 from autograder.paths import COURSE_LIB, ROOT, RUNS
 from autograder.proving import side_by_side
-from autograder.proving.dependencies import Code
-from course_lib.chapters import REFERENCES
+from autograder.proving.dependencies import PACKAGES, Code
 
 RUN_BY = (
     "autograder.authoring.freeze:write",
@@ -70,12 +70,15 @@ def executed_outputs(chapter: Chapter) -> list[list[NotebookNode]]:
     return [cell.outputs for cell in nbformat.read(cached, as_version=4).cells]
 
 
-def run_all(chapters: Sequence[Chapter], jobs: int | None = None) -> None:
+def run_all(chapters: Sequence[Chapter], jobs: int | None = None, first: Callable[[], None] | None = None) -> None:
     """Run the chapters whose outputs are not in the cache, side by side, a thread each; those that took longest begin first.
+    If there are any, `first` is called before.
 
     Raises: BookError with everything that failed, after all others have been run.
     """
     waiting = sorted((chapter for chapter in chapters if not _cached(chapter).exists()), key=_last_seconds, reverse=True)
+    if waiting and first:
+        first()
     failures = []
     for done in side_by_side.run(_run, waiting, jobs or os.cpu_count() or 1):
         if isinstance(done.error, BookError):
@@ -111,18 +114,39 @@ def code_inputs(chapter: Chapter) -> Inputs:
     that this code names, the records of its experiments, the pins."""
     own = f"autograder.checks.{chapter.assignment}"
     cells = [_source(chapter, cell) for cell in _code_cells(chapter)]
-    reached = Code(ROOT).reach([*RUN_BY, own], cells)
-    data = [
-        path
-        for folder in (COURSE_LIB, ROOT / "solutions")
-        for path in _data(folder)
-        if reached.mentions(path.relative_to(folder))
-    ]
+    fingerprint, data = _reached(chapter.assignment, [*RUN_BY, own], cells)
     text = "\n".join(cells)
     named = {name for name in _names(RUNS) if name in chapter.experiments or re.search(rf"[\"'/]{re.escape(name)}[\"'/]", text)}
     places = [RUNS / name for name in named]
     recorded = [path for place in places for path in (place.glob("[!.]*") if place.is_dir() else [place])]
-    return Inputs(reached.fingerprint, (*data, *recorded, ROOT / "requirements.txt", ROOT / "constraints.txt"))
+    return Inputs(fingerprint, (*data, *recorded, ROOT / "requirements.txt", ROOT / "constraints.txt"))
+
+
+def _reached(assignment: str, definitions: list[str], cells: list[str]) -> tuple[str, list[Path]]:
+    """The fingerprint of the code that a chapter reaches, and the data files that it names.
+
+    To follow the code takes some tenths of a second, so the answer is kept as long as no line of code has changed anywhere.
+    """
+    data = {path.relative_to(ROOT).as_posix(): path for folder in (COURSE_LIB, ROOT / "solutions") for path in _data(folder)}
+    code = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+    states = tuple((path, path.stat().st_mtime_ns, path.stat().st_size) for path in sorted(code))
+    question = content_hash([*definitions, *cells, *sorted(data), _hash_of(states)], ())
+    answers = cache_folder() / f"{assignment}-reached.json"
+    known = json.loads(answers.read_text(encoding="utf-8")) if answers.exists() else {}
+    if known.get("question") != question:
+        reached = Code(ROOT).reach(definitions, cells)
+        named = [name for name, path in data.items() if reached.mentions(Path(*Path(name).parts[1:]))]
+        known = {"question": question, "fingerprint": reached.fingerprint, "data": named}
+        unfinished = answers.with_suffix(f".{os.getpid()}-unfinished")
+        unfinished.write_text(json.dumps(known), encoding="utf-8")
+        unfinished.replace(answers)
+    return known["fingerprint"], [data[name] for name in known["data"]]
+
+
+@functools.lru_cache(maxsize=4)
+def _hash_of(states: tuple[tuple[Path, int, int], ...]) -> str:
+    """A hash of files as they are now, by path, time and size: once for all chapters of a build."""
+    return content_hash((), (path for path, _, _ in states))
 
 
 def _names(folder: Path) -> list[str]:
@@ -235,6 +259,8 @@ def _failure(chapter: Chapter, cell: Cell, reason: str, details: str) -> BookErr
 
 def _environment(folder: str) -> dict[str, str]:
     """The kernel's environment: this project importable, one thread, nobody's IPython or Matplotlib settings."""
+    from course_lib.chapters import REFERENCES  # loads torch
+
     inherited = {name: value for name, value in os.environ.items() if name not in {"MPLBACKEND", "PYTHONSTARTUP"}}
     return inherited | {
         "COURSE_BOOK": "1",

@@ -208,6 +208,16 @@ def test_all_chapters_run_and_every_error_is_told(tiny, tmp_path, monkeypatch, c
     assert ran == [97, 98, 99, 97, 99]  # 98 is kept
 
 
+def test_what_must_come_first_does_and_only_if_anything_runs(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr(execution, "ROOT", tmp_path)
+    monkeypatch.setattr(execution, "execution_key", lambda chapter: "key")
+    called: list[str] = []
+    monkeypatch.setattr(execution, "_execute", lambda chapter: called.append("run") or nbformat.v4.new_notebook())
+    for _ in range(2):
+        execution.run_all([tiny.before], jobs=1, first=lambda: called.append("first"))
+    assert called == ["first", "run"]
+
+
 def test_those_that_took_longest_begin_first(tiny, tmp_path, monkeypatch):
     monkeypatch.setattr(execution, "ROOT", tmp_path)
     monkeypatch.setattr(execution, "execution_key", lambda chapter: "new")
@@ -272,7 +282,7 @@ def bare(tiny, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(book, "all_chapters", lambda: [tiny.before, tiny.chapter])
         patch.setattr(book, "executed_outputs", lambda chapter: tiny.outputs if chapter.number == 99 else [])
-        patch.setattr(book, "run_all", lambda chapters: None)
+        patch.setattr(book, "run_all", lambda chapters, first: None)
         patch.setattr(book, "kill_rows", lambda chapter, keys: [])
         patch.setattr(book, "_build_key", lambda chapters, with_solutions: "tiny")
         patch.setattr(book, "cache_folder", lambda: folder)

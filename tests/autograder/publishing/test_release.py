@@ -11,7 +11,7 @@ import pytest
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-from autograder.authoring.chapter import all_chapters
+from autograder.authoring.chapter import load, page_names
 from autograder.authoring.contract import references, sources
 from autograder.publishing import release
 
@@ -181,21 +181,28 @@ def test_no_line_of_a_tiny_solution_and_no_name_of_the_judge_is_in_the_bundle(bu
             assert secret not in content, name
 
 
-def test_no_line_of_a_real_solution_or_check_is_in_the_real_bundle(tmp_path):
-    files = _readable(release.release(tmp_path))
+@pytest.fixture(scope="module")
+def real(tmp_path_factory, request):
+    """The real bundle, readable; with --only, that of one chapter."""
+    only = request.config.getoption("--only")
+    return _readable(release.release(tmp_path_factory.mktemp("real"), [only] if only else None))
+
+
+@pytest.mark.parametrize("assignment", [f"ch{number}" for number in page_names()])
+def test_no_line_of_a_real_solution_or_check_is_in_the_real_bundle(real, assignment):
     numbers = (".safetensors", ".parquet", ".mp4", ".webp", ".zip", ".npz")  # what is in an archive is here one by one
-    everything = b"\n".join({content for name, content in files.items() if not name.endswith(numbers)})
+    everything = b"\n".join({content for name, content in real.items() if not name.endswith(numbers)})
     library = "\n".join(path.read_text(encoding="utf-8") for path in release.paths.COURSE_LIB.rglob("*.py"))
-    for chapter in all_chapters():
-        found = sources(chapter)
-        bodies = [reference.body for reference in references(chapter, found).values()]
-        checks = (release.paths.ROOT / "autograder" / "checks" / f"{chapter.assignment}.py").read_text(encoding="utf-8")
-        lines = {line.strip() for line in "\n".join([*bodies, checks]).splitlines()}
-        ordinary = ("from ", "import ", '"')  # lines of text alone are messages, which learners read
-        meant = chapter.path.read_text(encoding="utf-8") + library  # a hint that quotes a line, a helper that has it, too
-        telling = {line for line in lines if len(line) > 30 and line not in meant and not line.startswith(ordinary)}
-        told = {line for line in {*telling, f"solutions.{chapter.assignment}"} if line.encode() in everything}
-        assert not {(line, name) for line in told for name, content in files.items() if line.encode() in content}
+    chapter = load(assignment)
+    found = sources(chapter)
+    bodies = [reference.body for reference in references(chapter, found).values()]
+    checks = (release.paths.ROOT / "autograder" / "checks" / f"{chapter.assignment}.py").read_text(encoding="utf-8")
+    lines = {line.strip() for line in "\n".join([*bodies, checks]).splitlines()}
+    ordinary = ("from ", "import ", '"')  # lines of text alone are messages, which learners read
+    meant = chapter.path.read_text(encoding="utf-8") + library  # a hint that quotes a line, a helper that has it, too
+    telling = {line for line in lines if len(line) > 30 and line not in meant and not line.startswith(ordinary)}
+    told = {line for line in {*telling, f"solutions.{chapter.assignment}"} if line.encode() in everything}
+    assert not {(line, name) for line in told for name, content in real.items() if line.encode() in content}
 
 
 def test_nbgraders_course_has_every_chapter_and_a_configuration(tiny, tmp_path):
