@@ -65,7 +65,8 @@ def sources(chapter: Chapter) -> Sources:
             name: place
             for number, page in pages.items()
             if number != chapter.number
-            for name, place in _exercises_of(path := paths.CHAPTERS / f"{page}.md", path.stat().st_mtime_ns)
+            for path in [paths.CHAPTERS / f"{page}.md"]
+            for name, place in _exercises_of(path, path.stat().st_mtime_ns)
         },
     )
 
