@@ -41,7 +41,7 @@ check: install
 	$(BIN)/ruff format --check
 	$(BIN)/python tools/format-chapters --check
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -q $(QUICK)
+	$(BIN)/python -m pytest -q $(IN_GROUPS) $(QUICK)
 
 bench: install
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[bench]'
