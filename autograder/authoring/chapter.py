@@ -144,9 +144,9 @@ def all_chapters(directory: Path | None = None) -> list[Chapter]:
     return [parse(path) for path in _sources(directory).values()]
 
 
-def page_names(directory: Path | None = None) -> dict[int, str]:
-    """The pages of all chapters by number, `{44: "ch44_gae"}`, from the names of their files: none is read."""
-    return {int(assignment.removeprefix("ch")): path.stem for assignment, path in _sources(directory).items()}
+def page_files(directory: Path | None = None) -> dict[int, Path]:
+    """The files of all chapters by number, `{44: …/ch44_gae.md}`: none is read. A page has its file's name."""
+    return {int(assignment.removeprefix("ch")): path for assignment, path in _sources(directory).items()}
 
 
 def _sources(directory: Path | None) -> dict[str, Path]:

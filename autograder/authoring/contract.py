@@ -17,7 +17,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Literal
 
 from autograder import paths
-from autograder.authoring.chapter import Cell, Chapter, ChapterError, page_names, parse
+from autograder.authoring.chapter import Cell, Chapter, ChapterError, page_files, parse
 
 if TYPE_CHECKING:
     from autograder.authoring.spec import Artefact, Exercise
@@ -51,7 +51,7 @@ class Reference:
 
 def sources(chapter: Chapter) -> Sources:
     """The real sources of a chapter of this checkout. ChapterError if its checks or its solutions are missing."""
-    pages = page_names()
+    files = page_files()
     solutions = _module(chapter, "solutions", "its reference functions")  # first, as the checks import them
     checks = _module(chapter, "checks", "a tuple `EXERCISES`")
     if not hasattr(checks, "EXERCISES"):
@@ -60,12 +60,11 @@ def sources(chapter: Chapter) -> Sources:
         checks.EXERCISES,
         solutions,
         paths.BIBLIOGRAPHY,
-        pages,
+        {number: path.stem for number, path in files.items()},
         {
             name: place
-            for number, page in pages.items()
+            for number, path in files.items()
             if number != chapter.number
-            for path in [paths.CHAPTERS / f"{page}.md"]
             for name, place in _exercises_of(path, path.stat().st_mtime_ns)
         },
     )

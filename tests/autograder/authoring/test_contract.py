@@ -79,7 +79,7 @@ def test_checks_without_a_stub_and_criteria_that_do_not_add_up_are_refused(tiny)
         assemble.verify(tiny.chapter, replace(sources, exercises=(uneven, sources.exercises[1])))
 
 
-@pytest.mark.parametrize("assignment", [f"ch{number}" for number in chapter.page_names()])
+@pytest.mark.parametrize("assignment", [f"ch{number}" for number in chapter.page_files()])
 def test_every_chapter_of_the_book_keeps_its_contract(assignment):
     assemble.verify(chapter.load(assignment))
 

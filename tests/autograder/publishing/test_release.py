@@ -11,7 +11,7 @@ import pytest
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-from autograder.authoring.chapter import load, page_names
+from autograder.authoring.chapter import load, page_files
 from autograder.authoring.contract import references, sources
 from autograder.publishing import release
 
@@ -188,7 +188,7 @@ def real(tmp_path_factory, request):
     return _readable(release.release(tmp_path_factory.mktemp("real"), [only] if only else None))
 
 
-@pytest.mark.parametrize("assignment", [f"ch{number}" for number in page_names()])
+@pytest.mark.parametrize("assignment", [f"ch{number}" for number in page_files()])
 def test_no_line_of_a_real_solution_or_check_is_in_the_real_bundle(real, assignment):
     numbers = (".safetensors", ".parquet", ".mp4", ".webp", ".zip", ".npz")  # what is in an archive is here one by one
     everything = b"\n".join({content for name, content in real.items() if not name.endswith(numbers)})
