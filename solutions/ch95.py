@@ -160,7 +160,8 @@ def ppo_token_loss(logps, old_logps, advantages, mask, clip_range=0.2):
         Receives gradient.
       old_logps: the same under the policy that sampled them; (B, L'). No gradient.
       advantages: of the tokens; (B, L'). No gradient.
-      mask: True at the completion's tokens; (B, L') bool.
+      mask: True at the completion's tokens; (B, L') bool. Elsewhere the others may hold
+        any finite numbers, which matter neither to the loss nor to its gradient.
       clip_range: ε ≥ 0, dimensionless; infinity means no clipping.
 
     Returns: scalar (0-dim) tensor, the mean over all kept tokens, not of row means.

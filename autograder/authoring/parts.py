@@ -64,6 +64,23 @@ def reshaped(inputs: Inputs, name: str, change: Callable[[torch.Tensor], torch.T
     return wrong
 
 
+def loud_padding(inputs: Inputs, *names: str, mask: str = "mask", size: float = 1e4) -> Inputs:
+    """The same arguments with ±size wherever the mask is False: what counts for nothing must matter to nothing, gradients included.
+
+    Finite, as a product with the mask is a right way to leave padding out, and 0 times infinity is none of its faults.
+    """
+
+    def loud(generator: torch.Generator) -> dict[str, Any]:
+        drawn = inputs(generator)
+        for name in names:
+            x = drawn[name]
+            kept = drawn[mask].bool().reshape(*drawn[mask].shape, *[1] * (x.dim() - drawn[mask].dim()))
+            drawn[name] = torch.where(kept, x, size * normal(generator, *x.shape).sign().to(x.dtype))
+        return drawn
+
+    return loud
+
+
 def drawing(draw: Callable[..., dict[str, Any]]) -> Callable[..., Inputs]:
     """Makes inputs with settings of a function that draws them: `@drawing` on `def steps(generator, size=8)`, then `steps(size=5)`."""
     return lambda *settings, **named: lambda generator: draw(generator, *settings, **named)

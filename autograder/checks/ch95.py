@@ -17,6 +17,7 @@ from autograder.authoring.parts import (
     dtype_lost,
     in_place,
     integers,
+    loud_padding,
     normal,
     python_float,
     refused,
@@ -1195,7 +1196,7 @@ def _mean(terms, mask):
     return terms[mask].mean()
 
 
-def _ppo(objective=_clip, reduce=_mean, ratio=lambda new, old: (new - old).exp(), leaks=(), checked=True):
+def _ppo(objective=_clip, reduce=_mean, ratio=lambda new, old: (new - old).exp(), leaks=(), checked=True, masked_first=True):
     """A version: `objective` of ratios, advantages and range, `reduce` of the terms and the mask."""
 
     def version(logps, old_logps, advantages, mask, clip_range=0.2):
@@ -1210,6 +1211,8 @@ def _ppo(objective=_clip, reduce=_mean, ratio=lambda new, old: (new - old).exp()
             logps, old_logps, advantages, mask = (x[:rows].expand(rows, -1) for x in (logps, old_logps, advantages, mask))
         old = old_logps if "old_logps" in leaks else old_logps.detach()
         weights = advantages if "advantages" in leaks else advantages.detach()
+        if masked_first:
+            logps, old, weights = (_zeroed(x, mask) for x in (logps, old, weights))
         return reduce(objective(ratio(logps, old), weights, clip_range), mask)
 
     return version
@@ -1226,6 +1229,8 @@ def _by_conditions(r, a, e):
 
 
 _EPOCH = _epoch()
+_LOUD_EPOCH = loud_padding(_EPOCH, "logps", "old_logps", "advantages")
+_LOUD_UNCLIPPED = loud_padding(_epoch(clip_range=INF), "logps", "old_logps", "advantages")
 
 PPO_TOKEN_LOSS = Exercise(
     name="ppo_token_loss",
@@ -1247,6 +1252,8 @@ PPO_TOKEN_LOSS = Exercise(
         Case("everything kept", _all_kept(_epoch(3, 5)), closed_form=_loss_by_tokens),
         Case("what is given requires gradient", _EPOCH, differentiate=_PPO[:3], visible=True, draws=3),
         Case("gradient in the first step", _first_step, differentiate=_PPO[:3], visible=True),
+        Case("gradient where padding holds ±10,000", _LOUD_EPOCH, differentiate=_PPO[:3], visible=True),
+        Case("gradient where padding holds ±10,000, any range", _LOUD_UNCLIPPED, differentiate=_PPO[:3]),
         Case("single precision", _EPOCH, dtype=torch.float32, visible=True),
         *shape_cases(_EPOCH, _PPO),
         refused(_EPOCH, clip_range=-0.1, visible=True),
@@ -1271,6 +1278,12 @@ PPO_TOKEN_LOSS = Exercise(
             "ratio-of-sequences",
             _ppo(ratio=lambda new, old: (new - old).sum(1, keepdim=True).exp().expand_as(new)),
             "One ratio for the whole text, the product over its tokens, leaves the clip's interval almost at once: each token has its own.",
+        ),
+        Misconception(
+            "ratio-of-padding",
+            _ppo(masked_first=False),
+            "The value is right and the gradient NaN: the ratio is formed for padding, too, where exp overflows, and infinity times the"
+            " mask's 0 is NaN on the way back. Leave padding out before exp, as in (logps - old_logps)[mask].",
         ),
         Misconception("sign-missing", after(_ppo(), torch.neg), "The objective is to be maximised, a loss minimised: negate it."),
         Misconception("not-clipped", _ppo(lambda r, a, e: -r * a), "Nothing is clipped."),

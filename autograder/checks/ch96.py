@@ -17,6 +17,7 @@ from autograder.authoring.parts import (
     dtype_lost,
     in_place,
     integers,
+    loud_padding,
     normal,
     python_float,
     refused,
@@ -118,6 +119,11 @@ LAST_TOKEN_SCORES = Exercise(
         Case("padding in between", _interrupted, closed_form=_by_reading_backwards),
         Case("one text", _padded("right", batch=1), closed_form=_by_reading_backwards),
         Case("values that require gradient", _padded("both"), differentiate=["values"], visible=True),
+        Case(
+            "gradient where padding holds ±10,000",
+            loud_padding(_padded("both"), "values", mask="attention_mask"),
+            differentiate=["values"],
+        ),
         Case("single precision", _padded("right"), dtype=torch.float32, visible=True),
         *shape_cases(_padded("right"), _TOKENS),
         Case(

@@ -16,6 +16,7 @@ from autograder.authoring.parts import (
     dtype_lost,
     in_place,
     integers,
+    loud_padding,
     normal,
     refused,
     reshaped,
@@ -67,6 +68,12 @@ def _nothing_kept(generator):
 
 def _unlikely(generator):
     return _texts(generator, scale=2000.0)
+
+
+def _loud(generator):
+    drawn = _texts(generator)
+    kept = functional.pad(drawn["completion_mask"][:, 1:], (0, 1))  # the logits at t predict the token at t + 1
+    return drawn | {"logits": loud_padding(lambda _: drawn | {"kept": kept}, "logits", mask="kept")(generator)["logits"]}
 
 
 def _even_odds(generator):
@@ -152,6 +159,7 @@ SEQUENCE_LOGPS = Exercise(
         Case("one long text", lambda g: _texts(g, 1, 40, 11), closed_form=_by_token),
         Case("texts of two tokens", _two_tokens, closed_form=_by_token),
         Case("logits that require gradient", _texts, differentiate=["logits"], visible=True),
+        Case("gradient where what is not kept has logits of ±10,000", _loud, differentiate=["logits"]),
         Case("single precision", _texts, dtype=torch.float32, visible=True),
         *shape_cases(_texts, _TEXTS),
         Case(
