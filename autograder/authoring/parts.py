@@ -200,3 +200,23 @@ def in_place(function: Callable, name: str, position: int = 0) -> Misconception:
         return result
 
     return Misconception("input-changed", wrong, IN_PLACE)
+
+
+def altered(inputs: Inputs, change: Callable[[dict[str, Any]], dict[str, Any]]) -> Inputs:
+    """The same arguments with some of them made anew from the others."""
+
+    def drawn_and_altered(generator: torch.Generator) -> dict[str, Any]:
+        drawn = inputs(generator)
+        return drawn | change(drawn)
+
+    return drawn_and_altered
+
+
+def rows_cut(formula: Callable) -> Callable:
+    """A formula that accepts tensors of unequal length: all are cut to the shortest, but single rows are repeated, as broadcasting does."""
+
+    def accepting(*given: Any) -> Any:
+        rows = min((len(x) for x in given if isinstance(x, torch.Tensor) and len(x) > 1), default=1)
+        return formula(*(x[:rows].expand(rows, *x.shape[1:]) if isinstance(x, torch.Tensor) else x for x in given))
+
+    return accepting

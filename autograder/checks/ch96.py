@@ -3,50 +3,57 @@
 from __future__ import annotations
 
 import math
+import statistics
 
 import numpy as np
 import torch
-from torch.nn import functional
+import torch.nn.functional as F
 
 from autograder.authoring.parts import (
+    IN_PLACE,
     METRIC,
-    SHAPES,
-    after,
+    altered,
+    bad_input_accepted,
     cut_from_graph,
+    drawing,
     drawn_once,
     dtype_lost,
     in_place,
     integers,
     loud_padding,
     normal,
+    number,
+    one_shape,
     python_float,
     refused,
     replaced,
     reshaped,
+    rows_cut,
+    satisfies,
     shape_cases,
+    versions_of,
+    wrong,
 )
 from autograder.authoring.spec import Case, Exercise, Misconception
 from solutions import ch96
 
+
+def _as_column(inputs, name):
+    """One argument, (B, 1): it broadcasts silently to a table of all pairs."""
+    return reshaped(inputs, name, lambda x: x[:, None])
+
+
 # ----------------------------------------------------------------------------------------------------- last_token_scores
 
 
-def _padded(side, whole_numbers=False, batch=5, length=7):
+@drawing
+def _padded(generator, side, batch=5, length=7, dtype=torch.bool):
     """Texts of 2 to 5 tokens, padded on one side or on both; numbers at padding are as large as any."""
-
-    def inputs(generator):
-        lengths = integers(generator, 2, 6, batch)
-        start = {"right": torch.zeros(batch), "left": length - lengths, "both": torch.ones(batch)}[side].long()
-        columns = torch.arange(length)
-        mask = (columns >= start[:, None]) & (columns < (start + lengths)[:, None])
-        return {"values": normal(generator, batch, length), "attention_mask": mask.long() if whole_numbers else mask}
-
-    return inputs
-
-
-def _no_padding(generator):
-    drawn = _padded("right")(generator)
-    return drawn | {"attention_mask": torch.ones_like(drawn["attention_mask"])}
+    lengths = integers(generator, 2, 6, batch)
+    start = {"right": torch.zeros(batch), "left": length - lengths, "both": torch.ones(batch)}[side].long()
+    columns = torch.arange(length)
+    mask = (columns >= start[:, None]) & (columns < (start + lengths)[:, None])
+    return {"values": normal(generator, batch, length), "attention_mask": mask.to(dtype)}
 
 
 def _single_tokens(generator):
@@ -54,54 +61,72 @@ def _single_tokens(generator):
     return drawn | {"attention_mask": torch.arange(7) == integers(generator, 0, 7, 5)[:, None]}
 
 
-def _interrupted(generator):
-    """Padding between prompt and completion, as when left-padded prompts meet right-padded answers of a batch."""
-    drawn = _padded("both")(generator)
-    mask = torch.tensor([True, True, False, False, True, False, False])
-    return drawn | {"attention_mask": mask.expand(5, 7).clone()}
+_NO_PADDING = reshaped(_padded("right"), "attention_mask", torch.ones_like)
+_LOUD = loud_padding(_padded("both"), "values", mask="attention_mask")
+# padding between prompt and completion, as when left-padded prompts meet right-padded answers of a batch
+_INTERRUPTED = replaced(_padded("both"), attention_mask=torch.tensor([[True, True, False, False, True, False, False]] * 5))
 
 
 def _by_reading_backwards(values, attention_mask):
-    rows = [
-        [value for value, keep in zip(row, kept, strict=True) if keep][-1]
-        for row, kept in zip(values, attention_mask, strict=True)
-    ]
-    return torch.stack(rows)
+    return torch.stack([row[kept.bool()].flip(0)[0] for row, kept in zip(values, attention_mask, strict=True)])
 
 
 _TOKENS = ("values", "attention_mask")
+_texts = versions_of(ch96.last_token_scores, one_shape(*_TOKENS))
 
 
-def _scores(formula, checked=True):
+def _scores(formula, **options):
     """A version: `formula` takes values and a bool mask."""
-
-    def version(values, attention_mask):
-        if checked and values.shape != attention_mask.shape:
-            raise ValueError(f"attention_mask has shape {tuple(attention_mask.shape)}, but values has {tuple(values.shape)}")
-        return formula(values, attention_mask.bool())
-
-    return version
+    return _texts(lambda v, m: formula(v, m.bool()), **options)
 
 
 def _picked(values, index):
     return values[torch.arange(len(index)), index]
 
 
-def _flipped(values, mask):
-    """The first kept token from behind."""
-    return _picked(values.flip(1), mask.flip(1).int().argmax(1))
+def _last(mask):
+    """The column of each row's last kept token."""
+    return (mask * torch.arange(mask.shape[1])).argmax(1)
 
 
-def _step_function(values, mask):
-    """One where exactly one kept token remains to be read."""
-    remaining = mask.flip(1).cumsum(1).flip(1)
-    return (values * ((remaining == 1) & mask)).sum(1)
-
-
-def _nonzero(values, mask):
-    last = torch.tensor([int(row.nonzero()[-1]) for row in mask])
-    return values.gather(1, last.unsqueeze(1))[:, 0]
-
+_WRONG_LAST_TOKEN_SCORES = {
+    "last-column": (
+        lambda v, m: v[:, -1],
+        "The last column is padding wherever a text is shorter than the longest one: look for the last kept token.",
+    ),
+    "number-of-tokens-as-position": (
+        lambda v, m: _picked(v, m.sum(1) - 1),
+        "The number of kept tokens less one is the last one's column only with padding on the right: search by position.",
+    ),
+    "before-the-first-padding": (
+        lambda v, m: _picked(v, (~m).int().argmax(1) - 1),
+        "This takes the token before the first padding, which under left padding, or with none, is another one.",
+    ),
+    "first-token": (
+        lambda v, m: _picked(v, m.int().argmax(1)),
+        "argmax finds the first of equal values: this is the first kept token, which has read nothing yet.",
+    ),
+    "first-padding": (
+        lambda v, m: _picked(v, (_last(m) + 1).clamp(max=m.shape[1] - 1)),
+        "One column too far: behind the last kept token there is padding.",
+    ),
+    "mean-over-tokens": (
+        lambda v, m: (v * m).sum(1) / m.sum(1),
+        "Earlier tokens have read only a part of the text: the score is the last one's value alone.",
+    ),
+    "sum-over-tokens": (
+        lambda v, m: (v * m).sum(1),
+        "A sum over tokens grows with the length: the score is the last one's value alone.",
+    ),
+    "highest-value": (
+        lambda v, m: v.masked_fill(~m, -math.inf).amax(1),
+        "The score is the last kept token's value, not the highest.",
+    ),
+    "column-of-scores": (
+        lambda v, m: v.gather(1, _last(m)[:, None]),
+        "The shape is (B, 1): one number for each text is asked for, (B,).",
+    ),
+}
 
 LAST_TOKEN_SCORES = Exercise(
     name="last_token_scores",
@@ -112,93 +137,33 @@ LAST_TOKEN_SCORES = Exercise(
         Case("padding on the right", _padded("right"), closed_form=_by_reading_backwards, visible=True, draws=3),
         Case("padding on the left", _padded("left"), closed_form=_by_reading_backwards, visible=True, draws=3),
         Case("padding on both sides", _padded("both"), closed_form=_by_reading_backwards),
-        Case("a mask of integers", _padded("right", whole_numbers=True), closed_form=_by_reading_backwards, visible=True),
-        Case("a mask of integers, padding on the left", _padded("left", whole_numbers=True), closed_form=_by_reading_backwards),
-        Case("no padding", _no_padding, closed_form=_by_reading_backwards),
+        Case("a mask of integers", _padded("right", dtype=torch.int64), closed_form=_by_reading_backwards, visible=True),
+        Case("a mask of integers, padding on the left", _padded("left", dtype=torch.int64), closed_form=_by_reading_backwards),
+        Case("no padding", _NO_PADDING, closed_form=_by_reading_backwards),
         Case("single tokens anywhere", _single_tokens, closed_form=_by_reading_backwards),
-        Case("padding in between", _interrupted, closed_form=_by_reading_backwards),
+        Case("padding in between", _INTERRUPTED, closed_form=_by_reading_backwards),
         Case("one text", _padded("right", batch=1), closed_form=_by_reading_backwards),
         Case("values that require gradient", _padded("both"), differentiate=["values"], visible=True),
-        Case(
-            "gradient where padding holds ±10,000",
-            loud_padding(_padded("both"), "values", mask="attention_mask"),
-            differentiate=["values"],
-        ),
+        Case("gradient where padding holds ±10,000", _LOUD, differentiate=["values"]),
         Case("single precision", _padded("right"), dtype=torch.float32, visible=True),
         *shape_cases(_padded("right"), _TOKENS),
-        Case(
-            "attention_mask a column short",
-            reshaped(_padded("both"), "attention_mask", lambda mask: mask[:, :-1]),
-            raises=_TOKENS,
-            draws=1,
-        ),
+        Case("attention_mask a column short", reshaped(_padded("both"), "attention_mask", lambda m: m[:, :-1]), raises=_TOKENS),
     ),
     misconceptions=(
-        Misconception(
-            "last-column",
-            _scores(lambda v, m: v[:, -1]),
-            "The last column is padding wherever a text is shorter than the longest one: look for the last kept token.",
-        ),
-        Misconception(
-            "number-of-tokens-as-position",
-            _scores(lambda v, m: _picked(v, m.sum(1) - 1)),
-            "The number of kept tokens less one is the last one's column only with padding on the right: search by position.",
-        ),
-        Misconception(
-            "before-the-first-padding",
-            _scores(lambda v, m: _picked(v, (~m).int().argmax(1) - 1)),
-            "This takes the token before the first padding, which under left padding, or with none, is another one.",
-        ),
-        Misconception(
-            "first-token",
-            _scores(lambda v, m: _picked(v, m.int().argmax(1))),
-            "argmax finds the first of equal values: this is the first kept token, which has read nothing yet.",
-        ),
-        Misconception(
-            "first-padding",
-            _scores(lambda v, m: _picked(v, (m * torch.arange(m.shape[1])).argmax(1).add(1).clamp(max=m.shape[1] - 1))),
-            "One column too far: behind the last kept token there is padding.",
-        ),
-        Misconception(
-            "mean-over-tokens",
-            _scores(lambda v, m: (v * m).sum(1) / m.sum(1)),
-            "Earlier tokens have read only a part of the text: the score is the last one's value alone.",
-        ),
-        Misconception(
-            "sum-over-tokens",
-            _scores(lambda v, m: (v * m).sum(1)),
-            "A sum over tokens grows with the length: the score is the last one's value alone.",
-        ),
-        Misconception(
-            "highest-value",
-            _scores(lambda v, m: v.masked_fill(~m, -math.inf).amax(1)),
-            "The score is the last kept token's value, not the highest.",
-        ),
-        Misconception(
-            "column-of-scores",
-            after(ch96.last_token_scores, lambda scores: scores[:, None]),
-            "The shape is (B, 1): one number for each text is asked for, (B,).",
-        ),
+        *wrong(_WRONG_LAST_TOKEN_SCORES, _scores),
         cut_from_graph(ch96.last_token_scores),
         dtype_lost(ch96.last_token_scores),
         in_place(ch96.last_token_scores, "values"),
-        Misconception("bad-input-accepted", _scores(lambda v, m: _unchecked_scores(v, m), checked=False), SHAPES),
+        bad_input_accepted(_scores(rows_cut(lambda v, m: _picked(v, _last(m))), checked=False)),
     ),
     variants={
         "read backwards in Python": _scores(_by_reading_backwards),
-        "flipped": _scores(_flipped),
-        "last True by nonzero": _scores(_nonzero),
-        "a mask of one": _scores(_step_function),
-        "largest position": _scores(lambda v, m: _picked(v, (m * torch.arange(m.shape[1])).max(1).indices)),
+        "flipped": _scores(lambda v, m: _picked(v.flip(1), m.flip(1).int().argmax(1))),
+        "last True by nonzero": _scores(lambda v, m: _picked(v, torch.tensor([int(row.nonzero()[-1]) for row in m]))),
+        "a mask of one": _scores(lambda v, m: (v * (m & (m.flip(1).cumsum(1).flip(1) == 1))).sum(1)),
+        "largest position": _scores(lambda v, m: _picked(v, _last(m))),
     },
 )
-
-
-def _unchecked_scores(values, mask):
-    last = (mask * torch.arange(mask.shape[1])).argmax(1)
-    rows = min(len(values), len(last)) if len(last) > 1 else len(values)
-    return values[:rows].gather(1, last.expand(max(rows, len(last)))[:rows, None]).squeeze(1)
-
 
 # ----------------------------------------------------------------------------------------------------- reward_model_loss
 
@@ -206,17 +171,17 @@ _SCORES = ("chosen_scores", "rejected_scores")
 _ALL = (*_SCORES, "margin")
 
 
-def _comparisons(batch=9, scale=1.5, margin=True):
-    def inputs(generator):
-        drawn = {"chosen_scores": 0.5 + scale * normal(generator, batch), "rejected_scores": scale * normal(generator, batch)}
-        return drawn | ({"margin": normal(generator, batch).abs()} if margin else {})
-
-    return inputs
+@drawing
+def _plain(generator, batch=9):
+    return {"chosen_scores": 0.5 + 1.5 * normal(generator, batch), "rejected_scores": 1.5 * normal(generator, batch)}
 
 
-_PLAIN = _comparisons(margin=False)
+@drawing
+def _with_margins(generator, batch=9, least=0.0):
+    return _plain(batch)(generator) | {"margin": least + normal(generator, batch).abs()}
 
 
+@drawing
 def _far(generator):
     """Scores 1,000 apart, either way."""
     side = torch.tensor([1.0, -1.0, 1.0, -1.0], dtype=torch.float64)
@@ -224,215 +189,190 @@ def _far(generator):
     return {"chosen_scores": base + 500 * side, "rejected_scores": base - 500 * side}
 
 
+@drawing
 def _undecided(generator):
     """A reward model that has not learnt anything: all its scores are equal."""
     chosen = normal(generator, 6)
     return {"chosen_scores": chosen, "rejected_scores": chosen.clone()}
 
 
-def _margin_reached(generator):
-    drawn = _comparisons()(generator)
-    return drawn | {"chosen_scores": drawn["rejected_scores"] + drawn["margin"]}
+_MARGIN_REACHED = altered(_with_margins(), lambda drawn: {"chosen_scores": drawn["rejected_scores"] + drawn["margin"]})
 
 
-def _one_comparison_each_way(generator):
-    drawn = _comparisons(1)(generator)
-    return drawn | {"margin": drawn["margin"] + 0.5}
-
-
-def _loss_by_formula(chosen_scores, rejected_scores, margin=None):
-    gaps = (
-        chosen_scores.detach().numpy() - rejected_scores.detach().numpy() - (0.0 if margin is None else margin.detach().numpy())
-    )
+def _loss_by_numpy(chosen_scores, rejected_scores, margin=None):
+    gaps = (chosen_scores - rejected_scores).detach().numpy() - (0.0 if margin is None else margin.detach().numpy())
     return torch.tensor(np.logaddexp(0, -gaps).mean())
 
 
-def _log_two(chosen_scores, **_rest):
-    return torch.tensor(math.log(2), dtype=chosen_scores.dtype)
+_compared = versions_of(
+    ch96.reward_model_loss,
+    one_shape(*_SCORES),
+    satisfies(lambda margin, chosen_scores: margin is None or margin.shape == chosen_scores.shape),
+    data=["margin"],
+)
 
 
-def _comparison(loss, gap=lambda c, r, m: c - r - m, leak=False, checked=True, reduce=torch.mean):
-    """A version: `gap` of the scores and the margin (0 if there is none), `loss` of each gap."""
-
-    def version(chosen_scores, rejected_scores, margin=None):
-        if checked:
-            for name, other in (("rejected_scores", rejected_scores), ("margin", margin)):
-                if other is not None and other.shape != chosen_scores.shape:
-                    raise ValueError(f"{name} has shape {tuple(other.shape)}, but chosen_scores has {tuple(chosen_scores.shape)}")
-        if margin is None:
-            margin = torch.zeros_like(rejected_scores)
-        gaps = gap(chosen_scores, rejected_scores, margin if leak else margin.detach())
-        return reduce(loss(gaps))
-
-    return version
-
-
-def _right(gaps):
-    return functional.softplus(-gaps)
+def _loss(formula, **options):
+    """A version: `formula` takes scores and margins, which are 0 if there are none."""
+    return _compared(lambda c, r, m: formula(c, r, torch.zeros_like(r) if m is None else m), **options)
 
 
 def _hand_softplus(x):
-    """log(1 + e^x), right in value, but with no gradient at 0, where relu and abs have none."""
-    return functional.relu(x) + torch.log1p(torch.exp(-x.abs()))
+    return F.relu(x) + torch.log1p(torch.exp(-x.abs()))
 
 
-def _pair_softmax(chosen_scores, rejected_scores, margin=None):
-    if chosen_scores.shape != rejected_scores.shape or (margin is not None and margin.shape != chosen_scores.shape):
-        raise ValueError("chosen_scores, rejected_scores and margin must have one shape")
-    chosen = chosen_scores if margin is None else chosen_scores - margin.detach()
-    logits = torch.stack([chosen, rejected_scores], dim=1)  # (B, 2)
-    return functional.cross_entropy(logits, torch.zeros(len(logits), dtype=torch.long))
-
-
-def _one_by_one(gaps):
-    return torch.stack([torch.logaddexp(torch.zeros_like(gap), -gap) for gap in gaps])
-
+_WRONG_REWARD_MODEL_LOSS = {
+    "chosen-and-rejected-swapped": (
+        lambda c, r, m: -F.logsigmoid(r - c - m).mean(),
+        "The loss falls as the rejected text's score rises: the gap is chosen minus rejected.",
+    ),
+    "sign-missing": (
+        lambda c, r, m: F.logsigmoid(c - r - m).mean(),
+        "log σ is to be maximised, a loss minimised: negate it.",
+    ),
+    "sigmoid-without-logarithm": (
+        lambda c, r, m: (1 - torch.sigmoid(c - r - m)).mean(),
+        "This is the share of wrong answers to be expected, whose gradient vanishes where the model is most wrong: take -log σ.",
+    ),
+    "logarithm-of-sigmoid": (
+        lambda c, r, m: -torch.sigmoid(c - r - m).log().mean(),
+        "σ underflows to 0 at large gaps and its logarithm is -inf: use torch.nn.functional.logsigmoid.",
+    ),
+    "logarithm-clamped": (
+        lambda c, r, m: -F.logsigmoid((c - r - m).clamp(-30, 30)).mean(),
+        "Clamping keeps the loss finite, and leaves the comparisons that are most wrong without gradient: use logsigmoid.",
+    ),
+    "no-gradient-at-zero": (
+        lambda c, r, m: _hand_softplus(r - c + m).mean(),
+        "The values are right, but relu and abs have gradient 0 at 0, and a new reward model starts exactly there: use logsigmoid.",
+    ),
+    "margin-added": (
+        lambda c, r, m: -F.logsigmoid(c - r + m).mean(),
+        "The margin makes the task harder, not easier: the gap has to exceed it, so subtract it.",
+    ),
+    "margin-ignored": (lambda c, r, m: -F.logsigmoid(c - r).mean(), "margin is not used."),
+    "margin-averaged": (
+        lambda c, r, m: -F.logsigmoid(c - r - m.mean()).mean(),
+        "Each comparison has a margin of its own.",
+    ),
+    "hinge": (
+        lambda c, r, m: F.relu(1 - (c - r - m)).mean(),
+        "This is a hinge loss: the Bradley-Terry model's likelihood is the sigmoid of the gap.",
+    ),
+    "squared-error": (
+        lambda c, r, m: (1 - torch.sigmoid(c - r - m)).square().mean(),
+        "This is the Brier score, a squared error: the negative log-likelihood is -log σ.",
+    ),
+    "sum-instead-of-mean": (
+        lambda c, r, m: -F.logsigmoid(c - r - m).sum(),
+        "A sum grows with the batch, and with it the step: take the mean.",
+    ),
+    "not-averaged": (
+        lambda c, r, m: -F.logsigmoid(c - r - m),
+        "One number is asked for: the mean over the comparisons.",
+    ),
+    "logarithm-of-mean": (
+        lambda c, r, m: -torch.sigmoid(c - r - m).mean().log(),
+        "The logarithm of the mean probability: each comparison has a likelihood of its own, so take logarithms first.",
+    ),
+    "rejected-detached": (
+        lambda c, r, m: -F.logsigmoid(c - r.detach() - m).mean(),
+        "Only chosen scores are pushed up; rejected ones are learnt from as well.",
+    ),
+}
 
 REWARD_MODEL_LOSS = Exercise(
     name="reward_model_loss",
     reference=ch96.reward_model_loss,
     criteria={"values": 1.35, "gradient": 0.6, "dtype": 0.1, "inputs": 0.1, "errors": 0.35},
     cases=drawn_once(
-        Case("nine comparisons", _PLAIN, closed_form=_loss_by_formula, visible=True, draws=3),
-        Case("with margins", _comparisons(), closed_form=_loss_by_formula, visible=True, draws=3),
-        Case("margin=None, said aloud", replaced(_PLAIN, margin=None), closed_form=_loss_by_formula),
-        Case("equal scores: log 2", _undecided, closed_form=_log_two, visible=True),
-        Case("gaps equal to the margins: log 2", _margin_reached, closed_form=_log_two),
-        Case("scores 1,000 apart", _far, closed_form=_loss_by_formula, visible=True),
-        Case("one comparison with a margin", _one_comparison_each_way, closed_form=_loss_by_formula),
-        Case("scores that require gradient", _PLAIN, differentiate=_SCORES, visible=True),
-        Case("everything requires gradient", _comparisons(), differentiate=_ALL, visible=True, draws=3),
-        Case("gradient where scores are equal", _undecided, differentiate=_SCORES, visible=True),
-        Case("gradient where scores are 1,000 apart", _far, differentiate=_SCORES),
-        Case("single precision", _comparisons(), dtype=torch.float32, visible=True),
-        *shape_cases(_comparisons(), _ALL),
-        Case("rejected_scores as a column", reshaped(_PLAIN, "rejected_scores", lambda x: x[:, None]), raises=_SCORES, draws=1),
-        Case("margin as a column", reshaped(_comparisons(), "margin", lambda x: x[:, None]), raises=_ALL, draws=1),
+        Case("nine comparisons", _plain(), closed_form=_loss_by_numpy, visible=True, draws=3),
+        Case("with margins", _with_margins(), closed_form=_loss_by_numpy, visible=True, draws=3),
+        Case("margin=None, said aloud", replaced(_plain(), margin=None), closed_form=_loss_by_numpy),
+        Case("equal scores: log 2", _undecided(), closed_form=number(math.log(2)), visible=True),
+        Case("gaps equal to the margins: log 2", _MARGIN_REACHED, closed_form=number(math.log(2))),
+        Case("scores 1,000 apart", _far(), closed_form=_loss_by_numpy, visible=True),
+        Case("one comparison with a margin", _with_margins(1, least=0.5), closed_form=_loss_by_numpy),
+        Case("scores that require gradient", _plain(), differentiate=_SCORES, visible=True),
+        Case("everything requires gradient", _with_margins(), differentiate=_ALL, visible=True, draws=3),
+        Case("gradient where scores are equal", _undecided(), differentiate=_SCORES, visible=True),
+        Case("gradient where scores are 1,000 apart", _far(), differentiate=_SCORES),
+        Case("single precision", _with_margins(), dtype=torch.float32, visible=True),
+        *shape_cases(_with_margins(), _ALL),
+        Case("rejected_scores as a column", _as_column(_plain(), "rejected_scores"), raises=_SCORES),
+        Case("margin as a column", _as_column(_with_margins(), "margin"), raises=_ALL),
     ),
     misconceptions=(
-        Misconception(
-            "chosen-and-rejected-swapped",
-            _comparison(_right, gap=lambda c, r, m: r - c - m),
-            "The loss falls as the rejected text's score rises: the gap is chosen minus rejected.",
-        ),
-        Misconception(
-            "sign-missing",
-            _comparison(lambda gaps: -_right(gaps)),
-            "log σ is to be maximised, a loss minimised: negate it.",
-        ),
-        Misconception(
-            "sigmoid-without-logarithm",
-            _comparison(lambda gaps: 1 - torch.sigmoid(gaps)),
-            "This is the share of wrong answers to be expected, whose gradient vanishes where the model is most wrong: take -log σ.",
-        ),
-        Misconception(
-            "logarithm-of-sigmoid",
-            _comparison(lambda gaps: -torch.sigmoid(gaps).log()),
-            "σ underflows to 0 at large gaps and its logarithm is -inf: use torch.nn.functional.logsigmoid.",
-        ),
-        Misconception(
-            "logarithm-clamped",
-            _comparison(lambda gaps: _right(gaps.clamp(-30, 30))),
-            "Clamping keeps the loss finite, and leaves the comparisons that are most wrong without gradient: use logsigmoid.",
-        ),
-        Misconception(
-            "no-gradient-at-zero",
-            _comparison(lambda gaps: _hand_softplus(-gaps)),
-            "The values are right, but relu and abs have gradient 0 at 0, and a new reward model starts exactly there: use logsigmoid.",
-        ),
-        Misconception(
-            "margin-added",
-            _comparison(_right, gap=lambda c, r, m: c - r + m),
-            "The margin makes the task harder, not easier: the gap has to exceed it, so subtract it.",
-        ),
-        Misconception("margin-ignored", _comparison(_right, gap=lambda c, r, m: c - r), "margin is not used."),
-        Misconception(
-            "margin-averaged",
-            _comparison(_right, gap=lambda c, r, m: c - r - m.mean()),
-            "Each comparison has a margin of its own.",
-        ),
-        Misconception(
-            "hinge",
-            _comparison(lambda gaps: functional.relu(1 - gaps)),
-            "This is a hinge loss: the Bradley-Terry model's likelihood is the sigmoid of the gap.",
-        ),
-        Misconception(
-            "squared-error",
-            _comparison(lambda gaps: (1 - torch.sigmoid(gaps)) ** 2),
-            "This is the Brier score, a squared error: the negative log-likelihood is -log σ.",
-        ),
-        Misconception(
-            "sum-instead-of-mean",
-            _comparison(_right, reduce=torch.sum),
-            "A sum grows with the batch, and with it the step: take the mean.",
-        ),
-        Misconception(
-            "not-averaged",
-            _comparison(_right, reduce=lambda losses: losses),
-            "One number is asked for: the mean over the comparisons.",
-        ),
-        Misconception(
-            "logarithm-of-mean",
-            _comparison(lambda gaps: -torch.sigmoid(gaps).mean().log().expand_as(gaps)),
-            "The logarithm of the mean probability: each comparison has a likelihood of its own, so take logarithms first.",
-        ),
+        *wrong(_WRONG_REWARD_MODEL_LOSS, _loss),
         Misconception(
             "gradient-into-margin",
-            _comparison(_right, leak=True),
+            _loss(lambda c, r, m: -F.logsigmoid(c - r - m).mean(), leak=True),
             "The margin is data, from how sure the raters were: detach it.",
-        ),
-        Misconception(
-            "rejected-detached",
-            _comparison(_right, gap=lambda c, r, m: c - r.detach() - m),
-            "Only chosen scores are pushed up; rejected ones are learnt from as well.",
         ),
         python_float(ch96.reward_model_loss),
         cut_from_graph(ch96.reward_model_loss),
         dtype_lost(ch96.reward_model_loss),
         in_place(ch96.reward_model_loss, "chosen_scores"),
-        Misconception("bad-input-accepted", _comparison(_right, checked=False), SHAPES),
+        bad_input_accepted(_loss(lambda c, r, m: -F.logsigmoid(c - r - m).mean(), checked=False)),
     ),
     variants={
-        "softplus": _comparison(_right),
-        "softmax of two": _pair_softmax,
-        "comparison by comparison": _comparison(_one_by_one),
-        "binary cross-entropy": _comparison(
-            lambda gaps: functional.binary_cross_entropy_with_logits(gaps, torch.ones_like(gaps), reduction="none")
+        "softplus": _loss(lambda c, r, m: F.softplus(r + m - c).mean()),
+        "softmax of two": _loss(lambda c, r, m: -torch.stack([c - m, r]).log_softmax(0)[0].mean()),
+        "comparison by comparison": _loss(
+            lambda c, r, m: sum(torch.logaddexp(x, y) - x for x, y in zip(c - m, r, strict=True)) / len(c)
         ),
-        "sum over count, in double precision": lambda chosen_scores, rejected_scores, margin=None: _comparison(
-            lambda gaps: -functional.logsigmoid(gaps.double()),
-            reduce=lambda losses: (losses.sum() / len(losses)).to(chosen_scores.dtype),
-        )(chosen_scores, rejected_scores, margin),
+        "binary cross-entropy": _loss(lambda c, r, m: F.binary_cross_entropy_with_logits(c - r - m, torch.ones_like(c))),
+        "sum over count, in double precision": _loss(
+            lambda c, r, m: (-F.logsigmoid((c - r - m).double()).sum() / len(c)).to(c.dtype)
+        ),
     },
 )
 
 # ------------------------------------------------------------------------------------------------------------- best_of_n
 
 
-def _candidates(batch=6, n=5, sign=0.0):
-    """Scores without ties; with `sign`, all of one sign."""
-
-    def inputs(generator):
-        scores = normal(generator, batch, n)
-        return {"scores": scores.abs() * sign if sign else scores}
-
-    return inputs
+@drawing
+def _candidates(generator, batch=6, n=5, change=lambda scores: scores):
+    """Scores without ties."""
+    return {"scores": change(normal(generator, batch, n))}
 
 
 def _search(scores):
-    best = []
-    for row in scores.tolist():
-        index = 0
-        for candidate, score in enumerate(row):
-            if score > row[index]:
-                index = candidate
-        best.append(index)
-    return torch.tensor(best)
+    return torch.tensor([max(range(len(row)), key=row.__getitem__) for row in scores.tolist()])
 
 
-def _sorted_last(scores):
-    return scores.sort(dim=1).indices[:, -1]
-
+_WRONG_BEST_OF_N = {
+    "lowest-score": (lambda scores: scores.argmin(-1), "This is the worst candidate: take the highest score."),
+    "scores-instead-of-indices": (
+        lambda scores: scores.detach().amax(-1),
+        "These are the best scores: which candidates have them is asked, as int64 indices.",
+    ),
+    "best-prompt": (
+        lambda scores: scores.argmax(0),
+        "For each candidate this finds the best prompt: search along the last axis, over the candidates of each prompt.",
+    ),
+    "whole-batch": (
+        lambda scores: scores.argmax(),
+        "One index for the whole batch: without dim, argmax searches everything. Each prompt needs its own.",
+    ),
+    "position-in-the-batch": (
+        lambda scores: scores.argmax(-1) + torch.arange(len(scores)) * scores.shape[1],
+        "These count through the whole batch: an index from 0 to n - 1 is asked for each prompt.",
+    ),
+    "largest-magnitude": (
+        lambda scores: scores.abs().argmax(-1),
+        "A very bad score is no good score: do not take the absolute value.",
+    ),
+    "all-indices-sorted": (
+        lambda scores: scores.argsort(-1, descending=True),
+        "This is the whole ranking, (B, n): only its first column is asked for.",
+    ),
+    "one-hot": (
+        lambda scores: (scores == scores.amax(-1, keepdim=True)).long(),
+        "This marks the best candidate, (B, n): its index is asked for, (B,).",
+    ),
+    "int32": (lambda scores: scores.argmax(-1).int(), "Indices are int64, or they index nothing in older code."),
+}
 
 BEST_OF_N = Exercise(
     name="best_of_n",
@@ -442,56 +382,18 @@ BEST_OF_N = Exercise(
     cases=(
         Case("five candidates for six prompts", _candidates(), closed_form=_search, visible=True, draws=3),
         Case("as many prompts as candidates", _candidates(4, 4), closed_form=_search, visible=True, draws=3),
-        Case("all scores negative", _candidates(sign=-1.0), closed_form=_search, visible=True),
-        Case("all scores positive", _candidates(sign=1.0), closed_form=_search),
-        Case("scores far below 0", lambda generator: {"scores": normal(generator, 6, 5) - 1e6}, closed_form=_search),
+        Case("all scores negative", _candidates(change=lambda scores: -scores.abs()), closed_form=_search, visible=True),
+        Case("all scores positive", _candidates(change=torch.abs), closed_form=_search),
+        Case("scores far below 0", _candidates(change=lambda scores: scores - 1e6), closed_form=_search),
         Case("a single candidate", _candidates(3, 1), closed_form=_search),
         Case("many candidates for one prompt", _candidates(1, 64), closed_form=_search),
         Case("scores that require gradient", _candidates(), differentiate=["scores"]),
         Case("single precision", _candidates(), dtype=torch.float32),
     ),
-    misconceptions=(
-        Misconception("lowest-score", lambda scores: scores.argmin(-1), "This is the worst candidate: take the highest score."),
-        Misconception(
-            "scores-instead-of-indices",
-            lambda scores: scores.detach().amax(-1),
-            "These are the best scores: which candidates have them is asked, as int64 indices.",
-        ),
-        Misconception(
-            "best-prompt",
-            lambda scores: scores.argmax(0),
-            "For each candidate this finds the best prompt: search along the last axis, over the candidates of each prompt.",
-        ),
-        Misconception(
-            "whole-batch",
-            lambda scores: scores.argmax(),
-            "One index for the whole batch: without dim, argmax searches everything. Each prompt needs its own.",
-        ),
-        Misconception(
-            "position-in-the-batch",
-            lambda scores: scores.argmax(-1) + torch.arange(len(scores)) * scores.shape[1],
-            "These count through the whole batch: an index from 0 to n - 1 is asked for each prompt.",
-        ),
-        Misconception(
-            "largest-magnitude",
-            lambda scores: scores.abs().argmax(-1),
-            "A very bad score is no good score: do not take the absolute value.",
-        ),
-        Misconception(
-            "all-indices-sorted",
-            lambda scores: scores.argsort(-1, descending=True),
-            "This is the whole ranking, (B, n): only its first column is asked for.",
-        ),
-        Misconception(
-            "one-hot",
-            lambda scores: (scores == scores.amax(-1, keepdim=True)).long(),
-            "This marks the best candidate, (B, n): its index is asked for, (B,).",
-        ),
-        Misconception("int32", lambda scores: scores.argmax(-1).int(), "Indices are int64, or they index nothing in older code."),
-    ),
+    misconceptions=wrong(_WRONG_BEST_OF_N),
     variants={
         "search": lambda scores: _search(scores),
-        "last of the sorted": _sorted_last,
+        "last of the sorted": lambda scores: scores.sort(dim=1).indices[:, -1],
         "NumPy": lambda scores: torch.from_numpy(scores.detach().numpy().argmax(1)),
         "topk": lambda scores: scores.topk(1, dim=-1).indices.squeeze(-1),
         "max": lambda scores: scores.max(dim=1)[1],
@@ -501,8 +403,10 @@ BEST_OF_N = Exercise(
 # ---------------------------------------------------------------------------------------------------------- best_of_n_kl
 
 
-def _n(low, high):
-    return lambda generator: {"n": int(integers(generator, low, high))}
+@drawing
+def _n(generator, low, high=None):
+    """A number of candidates: this one, or one from low to high - 1."""
+    return {"n": int(integers(generator, low, high or low + 1))}
 
 
 QUADRATURE = np.polynomial.legendre.leggauss(200)
@@ -515,137 +419,136 @@ def _kl_by_integral(n):
     return float((weights / 2 * (math.log(n) + (n - 1) / n * np.log(t))).sum())
 
 
-def _kl_version(formula):
-    def version(n):
-        if n < 1:
-            raise ValueError(f"expected n >= 1, but received {n!r}")
-        return formula(n)
+_kl = versions_of(ch96.best_of_n_kl, satisfies(lambda n: n >= 1))
 
-    return version
-
+_WRONG_BEST_OF_N_KL = {
+    "logarithm-alone": (
+        lambda n: math.log(n),
+        "log n is the surprise at the very best text; averaged over the best of n it is (n - 1) / n less.",
+    ),
+    "correction-added": (
+        lambda n: math.log(n) + (n - 1) / n,
+        "(n - 1) / n is subtracted: at n = 1 either sign gives 0, at n = 2 it has to be log 2 - 1/2.",
+    ),
+    "base-two": (lambda n: math.log2(n) - (n - 1) / n, "log2 gives bits: nats are asked for."),
+    "one-over-n": (
+        lambda n: math.log(n) - 1 / n,
+        "The correction is (n - 1) / n: at n = 1 there is no choice and no KL.",
+    ),
+    "not-divided": (lambda n: math.log(n) - (n - 1), "A KL is never negative: the correction is (n - 1) / n."),
+    "n-plus-one": (lambda n: math.log(n) - (n - 1) / (n + 1), "The correction's denominator is n."),
+    "the-wrong-way-round": (
+        lambda n: n - 1 - math.log(n),
+        "This is KL(policy ‖ best of n), the other direction: the expectation is over the best of n.",
+    ),
+    "tensor": (
+        lambda n: torch.tensor(math.log(n) - (n - 1) / n),
+        "A Python float is asked for: nothing here is learnt.",
+    ),
+}
 
 BEST_OF_N_KL = Exercise(
     name="best_of_n_kl",
     reference=ch96.best_of_n_kl,
     criteria={"values": 0.6, "errors": 0.15},
     cases=(
-        Case("n = 1: nothing is chosen", lambda generator: {"n": 1}, closed_form=lambda n: 0.0, visible=True, draws=1),
-        Case("n = 2", lambda generator: {"n": 2}, closed_form=lambda n: 0.6931471805599453 - 0.5, visible=True, draws=1),
-        Case("n = 4", lambda generator: {"n": 4}, closed_form=lambda n: 2 * math.log(2) - 0.75, visible=True, draws=1),
+        Case("n = 1: nothing is chosen", _n(1), closed_form=lambda n: 0.0, visible=True, draws=1),
+        Case("n = 2", _n(2), closed_form=lambda n: 0.6931471805599453 - 0.5, visible=True, draws=1),
+        Case("n = 4", _n(4), closed_form=lambda n: 2 * math.log(2) - 0.75, visible=True, draws=1),
         Case("a few", _n(3, 20), closed_form=_kl_by_integral, atol=1e-4, draws=3),
         Case("dozens", _n(20, 300), closed_form=_kl_by_integral, atol=1e-4, visible=True, draws=3),
-        Case("a million", lambda generator: {"n": 1_000_000}, closed_form=_kl_by_integral, atol=1e-4, draws=1),
-        refused(_n(2, 3), n=0, visible=True),
-        refused(_n(2, 3), n=-3),
-        refused(_n(2, 3), n=0.5),
+        Case("a million", _n(1_000_000), closed_form=_kl_by_integral, atol=1e-4, draws=1),
+        refused(_n(2), n=0, visible=True),
+        refused(_n(2), n=-3),
+        refused(_n(2), n=0.5),
     ),
     misconceptions=(
-        Misconception(
-            "logarithm-alone",
-            _kl_version(math.log),
-            "log n is the surprise at the very best text; averaged over the best of n it is (n - 1) / n less.",
-        ),
-        Misconception(
-            "correction-added",
-            _kl_version(lambda n: math.log(n) + (n - 1) / n),
-            "(n - 1) / n is subtracted: at n = 1 either sign gives 0, at n = 2 it has to be log 2 - 1/2.",
-        ),
-        Misconception("base-two", _kl_version(lambda n: math.log2(n) - (n - 1) / n), "log2 gives bits: nats are asked for."),
-        Misconception(
-            "one-over-n",
-            _kl_version(lambda n: math.log(n) - 1 / n),
-            "The correction is (n - 1) / n: at n = 1 there is no choice and no KL.",
-        ),
-        Misconception(
-            "not-divided", _kl_version(lambda n: math.log(n) - (n - 1)), "A KL is never negative: the correction is (n - 1) / n."
-        ),
-        Misconception("n-plus-one", _kl_version(lambda n: math.log(n) - (n - 1) / (n + 1)), "The correction's denominator is n."),
-        Misconception(
-            "the-wrong-way-round",
-            _kl_version(lambda n: n - 1 - math.log(n)),
-            "This is KL(policy ‖ best of n), the other direction: the expectation is over the best of n.",
-        ),
-        Misconception(
-            "tensor",
-            _kl_version(lambda n: torch.tensor(math.log(n) - (n - 1) / n)),
-            "A Python float is asked for: nothing here is learnt.",
-        ),
-        Misconception(
-            "bad-input-accepted",
+        *wrong(_WRONG_BEST_OF_N_KL, _kl),
+        bad_input_accepted(
             lambda n: math.log(max(n, 1)) - (n - 1) / n if n else 0.0,
             "n < 1 must be refused with a ValueError that names n.",
         ),
     ),
     variants={
-        "1 / n - 1": _kl_version(lambda n: math.log(n) + 1 / n - 1),
-        "NumPy": _kl_version(lambda n: float(np.log(n) - (n - 1) / n)),
-        "torch": _kl_version(lambda n: (torch.tensor(float(n), dtype=torch.float64).log() - 1 + 1 / n).item()),
-        "log1p": _kl_version(lambda n: math.log1p(n - 1) - (1 - 1 / n)),
+        "1 / n - 1": _kl(lambda n: math.log(n) + 1 / n - 1),
+        "NumPy": _kl(lambda n: float(np.log(n) - (n - 1) / n)),
+        "torch": _kl(lambda n: (torch.tensor(float(n), dtype=torch.float64).log() - 1 + 1 / n).item()),
+        "log1p": _kl(lambda n: math.log1p(n - 1) - (1 - 1 / n)),
     },
 )
 
 # ---------------------------------------------------------------------------------------------------- length_correlation
 
 
-def _lengths(slope, batch=12, whole_numbers=True):
+@drawing
+def _lengths(generator, slope, batch=12, dtype=torch.int64):
     """Scores that rise by `slope` standard deviations of theirs for one of the lengths'."""
-
-    def inputs(generator):
-        lengths = integers(generator, 5, 60, batch)
-        lengths[:2] = torch.tensor([5, 60])
-        scores = slope * (lengths - lengths.double().mean()) / lengths.double().std() + normal(generator, batch) + 3.0
-        return {"scores": scores, "lengths": lengths if whole_numbers else lengths.double()}
-
-    return inputs
+    lengths = integers(generator, 5, 60, batch)
+    lengths[:2] = torch.tensor([5, 60])
+    scores = slope * (lengths - lengths.double().mean()) / lengths.double().std() + normal(generator, batch) + 3.0
+    return {"scores": scores, "lengths": lengths.to(dtype)}
 
 
-def _straight_line(generator):
-    drawn = _lengths(0.0)(generator)
-    return drawn | {"scores": 2.0 - 0.25 * drawn["lengths"].double()}
-
-
-def _one_outlier(generator):
-    """A very long text: ranks and values say different things."""
-    drawn = _lengths(0.5)(generator)
-    drawn["lengths"][3] = 500
-    return drawn
+_STRAIGHT_LINE = altered(_lengths(0.0), lambda drawn: {"scores": 2.0 - 0.25 * drawn["lengths"].double()})
+# a very long text: ranks and values say different things
+_ONE_OUTLIER = reshaped(_lengths(0.5), "lengths", lambda lengths: lengths.index_fill(0, torch.tensor([3]), 500))
 
 
 def _by_numpy(scores, lengths):
     return torch.tensor(np.corrcoef(scores.detach().numpy(), lengths.numpy())[0, 1], dtype=scores.dtype)
 
 
-def _correlation(formula, checked=True):
-    """A version: `formula` takes both, detached and in the scores' dtype."""
+_BOTH = ("scores", "lengths")
+_measured = versions_of(ch96.length_correlation, one_shape(*_BOTH), data=_BOTH)
 
-    def version(scores, lengths):
-        if checked and scores.shape != lengths.shape:
-            raise ValueError(f"lengths has shape {tuple(lengths.shape)}, but scores has {tuple(scores.shape)}")
-        return formula(scores.detach(), lengths.detach().to(scores.dtype))
 
-    return version
+def _correlation(formula, **options):
+    """A version: `formula` takes both in the scores' dtype."""
+    return _measured(lambda scores, lengths: formula(scores, lengths.to(scores.dtype)), **options)
+
+
+def _covariance(a, b):
+    return ((a - a.mean()) * (b - b.mean())).mean()
+
+
+def _cosine(a, b):
+    return (a @ b) / (a.norm() * b.norm())
 
 
 def _pearson(a, b):
-    a, b = a - a.mean(), b - b.mean()
-    return (a @ b) / (a.norm() * b.norm())
+    return _cosine(a - a.mean(), b - b.mean())
 
 
 def _ranks(x):
     return x.argsort().argsort().to(x.dtype)
 
 
-def _broadcast_pearson(a, b):
-    a, b = a - a.mean(), b - b.mean()
-    rows = min(len(a), len(b)) if len(b) > 1 else len(a)
-    a, b = a[:rows], b[:rows]
-    return (a * b).sum() / (a.square().sum() * b.square().sum()).sqrt()
-
-
-def _graph_kept(scores, lengths):
-    ch96.length_correlation(scores, lengths)
-    return _pearson(scores, lengths.to(scores.dtype))
-
+_WRONG_LENGTH_CORRELATION = {
+    "covariance": (
+        _covariance,
+        "This is the covariance, in units of score times tokens: divide by both standard deviations.",
+    ),
+    "slope": (
+        lambda a, b: _covariance(a, b) / _covariance(b, b),
+        "This is the slope of a regression, score per token: divide by both standard deviations instead.",
+    ),
+    "not-centred": (
+        _cosine,
+        "This is the cosine between two lists: subtract the means first, or any two positive lists agree.",
+    ),
+    "ranks": (
+        lambda a, b: _pearson(_ranks(a), _ranks(b)),
+        "This is Spearman's correlation, of ranks: Pearson's is of the values.",
+    ),
+    "squared": (lambda a, b: _pearson(a, b) ** 2, "This is R², which has lost the sign."),
+    "absolute": (lambda a, b: _pearson(a, b).abs(), "The sign is lost: shorter may be better."),
+    "sign-flipped": (lambda a, b: -_pearson(a, b), "Longer is better should give a positive number."),
+    "mixed-deviations": (
+        lambda a, b: _covariance(a, b) / (a.std() * b.std()),
+        "A mean over B is divided by deviations over B - 1: on a straight line the result is not ±1. Use one of the two throughout.",
+    ),
+    "logarithm-of-lengths": (lambda a, b: _pearson(a, b.log()), "Correlate with the lengths themselves."),
+}
 
 LENGTH_CORRELATION = Exercise(
     name="length_correlation",
@@ -655,69 +558,29 @@ LENGTH_CORRELATION = Exercise(
         Case("longer is better", _lengths(1.0), closed_form=_by_numpy, visible=True, draws=3),
         Case("shorter is better", _lengths(-1.0), closed_form=_by_numpy, visible=True),
         Case("nothing to see", _lengths(0.0), closed_form=_by_numpy),
-        Case("lengths as floating-point numbers", _lengths(0.5, whole_numbers=False), closed_form=_by_numpy),
-        Case(
-            "on a falling line: -1", _straight_line, closed_form=lambda scores, lengths: torch.tensor(-1.0).double(), visible=True
-        ),
-        Case("one very long text", _one_outlier, closed_form=_by_numpy),
+        Case("lengths as floating-point numbers", _lengths(0.5, dtype=torch.float64), closed_form=_by_numpy),
+        Case("on a falling line: -1", _STRAIGHT_LINE, closed_form=number(-1.0), visible=True),
+        Case("one very long text", _ONE_OUTLIER, closed_form=_by_numpy),
         Case("three texts", _lengths(0.5, batch=3), closed_form=_by_numpy),
         Case("scores that require gradient", _lengths(0.5), differentiate=["scores"], visible=True),
         Case("single precision", _lengths(0.5), dtype=torch.float32, visible=True),
-        *shape_cases(_lengths(0.5), ("scores", "lengths")),
+        *shape_cases(_lengths(0.5), _BOTH),
     ),
     misconceptions=(
-        Misconception(
-            "covariance",
-            _correlation(lambda a, b: ((a - a.mean()) * (b - b.mean())).mean()),
-            "This is the covariance, in units of score times tokens: divide by both standard deviations.",
-        ),
-        Misconception(
-            "slope",
-            _correlation(lambda a, b: ((a - a.mean()) @ (b - b.mean())) / (b - b.mean()).square().sum()),
-            "This is the slope of a regression, score per token: divide by both standard deviations instead.",
-        ),
-        Misconception(
-            "not-centred",
-            _correlation(lambda a, b: (a @ b) / (a.norm() * b.norm())),
-            "This is the cosine between two lists: subtract the means first, or any two positive lists agree.",
-        ),
-        Misconception(
-            "ranks",
-            _correlation(lambda a, b: _pearson(_ranks(a), _ranks(b))),
-            "This is Spearman's correlation, of ranks: Pearson's is of the values.",
-        ),
-        Misconception("squared", _correlation(lambda a, b: _pearson(a, b) ** 2), "This is R², which has lost the sign."),
-        Misconception("absolute", _correlation(lambda a, b: _pearson(a, b).abs()), "The sign is lost: shorter may be better."),
-        Misconception(
-            "sign-flipped", _correlation(lambda a, b: -_pearson(a, b)), "Longer is better should give a positive number."
-        ),
-        Misconception(
-            "mixed-deviations",
-            _correlation(lambda a, b: ((a - a.mean()) * (b - b.mean())).mean() / (a.std() * b.std())),
-            "A mean over B is divided by deviations over B - 1: on a straight line the result is not ±1. Use one of the two throughout.",
-        ),
-        Misconception(
-            "logarithm-of-lengths",
-            _correlation(lambda a, b: _pearson(a, b.log())),
-            "Correlate with the lengths themselves.",
-        ),
-        Misconception("graph-kept", _graph_kept, METRIC),
+        *wrong(_WRONG_LENGTH_CORRELATION, _correlation),
+        Misconception("graph-kept", _correlation(_pearson, leak=True), METRIC),
         dtype_lost(ch96.length_correlation),
         in_place(ch96.length_correlation, "scores"),
-        Misconception("bad-input-accepted", _correlation(_broadcast_pearson, checked=False), SHAPES),
+        bad_input_accepted(_correlation(rows_cut(_pearson), checked=False)),
     ),
     variants={
-        "NumPy": _correlation(lambda a, b: _by_numpy(a, b)),
+        "NumPy": _correlation(_by_numpy),
         "torch.corrcoef": _correlation(lambda a, b: torch.corrcoef(torch.stack([a, b]))[0, 1]),
         "cosine of centred lists": _correlation(_pearson),
         "standardised by the unbiased deviation": _correlation(
             lambda a, b: ((a - a.mean()) / a.std() * (b - b.mean()) / b.std()).sum() / (len(a) - 1)
         ),
-        "in Python": _correlation(
-            lambda a, b: torch.tensor(
-                _pearson(torch.tensor(a.tolist()).double(), torch.tensor(b.tolist()).double()).item(), dtype=a.dtype
-            )
-        ),
+        "in Python": _correlation(lambda a, b: torch.tensor(statistics.correlation(a.tolist(), b.tolist()), dtype=a.dtype)),
     },
 )
 
@@ -726,22 +589,14 @@ LENGTH_CORRELATION = Exercise(
 _PAIR = ("first", "second", "first_ratings", "second_ratings")
 
 
-def _opinions(low, high, batch=14, kind=torch.int8):
+@drawing
+def _opinions(generator, low, high, batch=14, dtype=torch.int8):
     """Pairs of texts and ratings from low to high; two of the pairs are ties and two are decided, one each way."""
-
-    def inputs(generator):
-        texts = torch.randperm(40, generator=generator)[: 2 * batch]
-        ratings = integers(generator, low, high + 1, 2, batch)
-        ratings[:, :4] = torch.tensor([[low, high, high, low], [low, high, low, high]])
-        ratings = ratings[:, torch.randperm(batch, generator=generator)].to(kind)
-        return dict(zip(_PAIR, (texts[:batch], texts[batch:], *ratings), strict=True))
-
-    return inputs
-
-
-def _half_stars(generator):
-    drawn = _opinions(2, 9)(generator)
-    return {name: value / 2 if name.endswith("ratings") else value for name, value in drawn.items()}
+    texts = torch.randperm(40, generator=generator)[: 2 * batch]
+    ratings = integers(generator, low, high + 1, 2, batch)
+    ratings[:, :4] = torch.tensor([[low, high, high, low], [low, high, low, high]])
+    ratings = ratings[:, torch.randperm(batch, generator=generator)].to(dtype)
+    return dict(zip(_PAIR, (texts[:batch], texts[batch:], *ratings), strict=True))
 
 
 def _one_left(generator):
@@ -751,57 +606,42 @@ def _one_left(generator):
     return drawn
 
 
-def _without(tied):
-    def inputs(generator):
-        drawn = _opinions(-4, 4)(generator)
-        keep = (drawn["first_ratings"] == drawn["second_ratings"]) == tied
+def _only(ties):
+    """The pairs that are ties, or those that are not."""
+
+    def some(drawn):
+        keep = (drawn["first_ratings"] == drawn["second_ratings"]) == ties
         return {name: value[keep] for name, value in drawn.items()}
 
-    return inputs
+    return altered(_opinions(-4, 4), some)
+
+
+_HALF_STARS = altered(_opinions(2, 9), lambda drawn: {name: drawn[name] / 2 for name in _PAIR[2:]})
 
 
 def _pair_by_pair(first, second, first_ratings, second_ratings):
     kept = []
-    for a, b, rating_a, rating_b in zip(
-        first.tolist(), second.tolist(), first_ratings.tolist(), second_ratings.tolist(), strict=True
-    ):
-        if rating_a > rating_b:
-            kept.append((a, b))
-        elif rating_b > rating_a:
-            kept.append((b, a))
-    table = torch.tensor(kept, dtype=torch.int64).reshape(-1, 2)
-    return table[:, 0], table[:, 1]
+    for *texts, a, b in zip(*(x.tolist() for x in (first, second, first_ratings, second_ratings)), strict=True):
+        if a != b:
+            kept.append(texts if a > b else texts[::-1])
+    return tuple(torch.tensor(kept, dtype=torch.int64).reshape(-1, 2).unbind(1))
 
 
-def _choices(formula, checked=True):
-    """A version: `formula` takes all four and is protected from unequal shapes."""
-
-    def version(first, second, first_ratings, second_ratings):
-        given = (second, first_ratings, second_ratings)
-        if checked and any(other.shape != first.shape for other in given):
-            raise ValueError(f"first has shape {tuple(first.shape)}, but second, first_ratings or second_ratings has another")
-        return formula(first, second, first_ratings, second_ratings)
-
-    return version
+_choices = versions_of(ch96.repaired_choices, one_shape(*_PAIR))
 
 
-def _decided_by(wins, keep):
-    """A version by two masks, each a function of the ratings: where the first text wins, and which pairs count."""
+def _decided(first_wins, kept):
+    """A formula by two masks, of the ratings: where the first text wins, and which pairs count."""
 
     def formula(first, second, a, b):
-        kept, first_wins = keep(a, b), wins(a, b)
-        return torch.where(first_wins, first, second)[kept], torch.where(first_wins, second, first)[kept]
+        wins, rows = first_wins(a, b), kept(a, b)
+        return torch.where(wins, first, second)[rows], torch.where(wins, second, first)[rows]
 
-    return _choices(formula)
+    return formula
 
 
 def _everything(a, b):
     return torch.ones_like(a, dtype=torch.bool)
-
-
-def _by_winner(first, second, a, b):
-    """First the pairs that the first text wins, then the others."""
-    return torch.cat([first[a > b], second[b > a]]), torch.cat([second[a > b], first[b > a]])
 
 
 def _by_gather(first, second, a, b):
@@ -811,22 +651,70 @@ def _by_gather(first, second, a, b):
 
 
 def _by_sign(first, second, a, b):
-    sign = (a.long() - b.long()).sign() if not a.is_floating_point() else (a - b).sign().long()
-    rows = sign.nonzero().squeeze(1)
+    sign = (a.double() - b.double()).sign().long()
     middle, half = first + second, (first - second) * sign
-    return ((middle + half) // 2)[rows], ((middle - half) // 2)[rows]
+    return ((middle + half) // 2)[sign != 0], ((middle - half) // 2)[sign != 0]
 
 
 def _pairs_by_numpy(first, second, a, b):
     first, second, a, b = (x.numpy() for x in (first, second, a, b))
     kept = np.flatnonzero(a != b)
-    return (torch.from_numpy(np.where(wins, x, y)[kept]) for wins, x, y in ((a > b, first, second), (a > b, second, first)))
+    return tuple(torch.from_numpy(np.where(a > b, *texts)[kept]) for texts in ((first, second), (second, first)))
 
 
-def _cut_to_the_shortest(first, second, a, b):
-    rows = min(map(len, (first, second, a, b)))
-    return ch96.repaired_choices(first[:rows], second[:rows], a[:rows], b[:rows])
+def _exchanged_in_place(first, second, a, b):
+    second_wins = b > a
+    first[second_wins], second[second_wins] = second[second_wins], first[second_wins]
+    return first[a != b], second[a != b]
 
+
+_WRONG_DECISIONS = {
+    "ties-to-the-first": (
+        _decided(lambda a, b: a >= b, _everything),
+        "This is the suspect's rule: a tie counts as a victory of the first text, and which text comes first is no accident.",
+    ),
+    "ties-to-the-second": (
+        _decided(lambda a, b: a > b, _everything),
+        "Now ties count as victories of the second text: the same fault the other way round. A tie says nothing.",
+    ),
+    "ties-at-random": (
+        _decided(lambda a, b: (a > b) | ((a == b) & (torch.arange(len(a)) % 2 == 0)), _everything),
+        "Ties that fall to either side by turns teach no length, but they are noise: leave them out.",
+    ),
+    "chosen-and-rejected-swapped": (
+        _decided(lambda a, b: a < b, lambda a, b: a != b),
+        "The text with the higher rating is chosen: here it is rejected.",
+    ),
+    "only-where-the-first-wins": (
+        _decided(lambda a, b: a > b, lambda a, b: a > b),
+        "Pairs that the second text wins are left out as well: now the first text always wins, which is worse than before.",
+    ),
+    "only-where-the-second-wins": (
+        _decided(lambda a, b: a > b, lambda a, b: a < b),
+        "Pairs that the first text wins are left out as well: only ties say nothing.",
+    ),
+    "neutral-left-out": (
+        _decided(lambda a, b: a > b, lambda a, b: (a != 0) & (b != 0) & (a != b)),
+        "A neutral text against a positive one is a clear preference: leave out equal ratings, not ratings of 0.",
+    ),
+    "ties-kept-the-rest-left-out": (
+        _decided(lambda a, b: a >= b, lambda a, b: a == b),
+        "The mask is the wrong way round: these are the pairs that say nothing.",
+    ),
+    "positions-of-pairs": (
+        lambda first, second, a, b: ((a > b).nonzero().squeeze(1), (b > a).nonzero().squeeze(1)),
+        "These are positions in the list of pairs: indices of texts are asked for, from first and second.",
+    ),
+    "order-lost": (
+        lambda first, second, a, b: (torch.cat([first[a > b], second[b > a]]), torch.cat([second[a > b], first[b > a]])),
+        "The pairs have changed their order: whatever else is known of each pair no longer belongs to it.",
+    ),
+    "int32": (
+        lambda *given: tuple(index.int() for index in ch96.repaired_choices(*given)),
+        "Indices are int64, or they index nothing in older code.",
+    ),
+    "input-changed": (_exchanged_in_place, IN_PLACE),
+}
 
 REPAIRED_CHOICES = Exercise(
     name="repaired_choices",
@@ -835,78 +723,23 @@ REPAIRED_CHOICES = Exercise(
     cases=drawn_once(
         Case("ratings from -4 to 4", _opinions(-4, 4), closed_form=_pair_by_pair, visible=True, draws=3),
         Case("negative, neutral or positive", _opinions(-1, 1), closed_form=_pair_by_pair, visible=True, draws=3),
-        Case("stars as floating-point numbers", _opinions(1, 5, kind=torch.float32), closed_form=_pair_by_pair, visible=True),
-        Case("half stars", _half_stars, closed_form=_pair_by_pair),
-        Case("no ties", _without(tied=False), closed_form=_pair_by_pair),
+        Case("stars as floating-point numbers", _opinions(1, 5, dtype=torch.float32), closed_form=_pair_by_pair, visible=True),
+        Case("half stars", _HALF_STARS, closed_form=_pair_by_pair),
+        Case("no ties", _only(ties=False), closed_form=_pair_by_pair),
         Case("one pair left", _one_left, closed_form=_pair_by_pair),
-        Case("nothing but ties", _without(tied=True), closed_form=_pair_by_pair),
+        Case("nothing but ties", _only(ties=True), closed_form=_pair_by_pair),
         *shape_cases(_opinions(-1, 1), _PAIR),
     ),
     misconceptions=(
-        Misconception(
-            "ties-to-the-first",
-            _decided_by(lambda a, b: a >= b, _everything),
-            "This is the suspect's rule: a tie counts as a victory of the first text, and which text comes first is no accident.",
-        ),
-        Misconception(
-            "ties-to-the-second",
-            _decided_by(lambda a, b: a > b, _everything),
-            "Now ties count as victories of the second text: the same fault the other way round. A tie says nothing.",
-        ),
-        Misconception(
-            "ties-at-random",
-            _decided_by(lambda a, b: (a > b) | ((a == b) & (torch.arange(len(a)) % 2 == 0)), _everything),
-            "Ties that fall to either side by turns teach no length, but they are noise: leave them out.",
-        ),
-        Misconception(
-            "chosen-and-rejected-swapped",
-            _decided_by(lambda a, b: a < b, lambda a, b: a != b),
-            "The text with the higher rating is chosen: here it is rejected.",
-        ),
-        Misconception(
-            "only-where-the-first-wins",
-            _decided_by(lambda a, b: a > b, lambda a, b: a > b),
-            "Pairs that the second text wins are left out as well: now the first text always wins, which is worse than before.",
-        ),
-        Misconception(
-            "only-where-the-second-wins",
-            _decided_by(lambda a, b: a > b, lambda a, b: a < b),
-            "Pairs that the first text wins are left out as well: only ties say nothing.",
-        ),
-        Misconception(
-            "neutral-left-out",
-            _decided_by(lambda a, b: a > b, lambda a, b: (a != 0) & (b != 0) & (a != b)),
-            "A neutral text against a positive one is a clear preference: leave out equal ratings, not ratings of 0.",
-        ),
-        Misconception(
-            "ties-kept-the-rest-left-out",
-            _decided_by(lambda a, b: a >= b, lambda a, b: a == b),
-            "The mask is the wrong way round: these are the pairs that say nothing.",
-        ),
-        Misconception(
-            "positions-of-pairs",
-            _choices(lambda first, second, a, b: ((a > b).nonzero().squeeze(1), (b > a).nonzero().squeeze(1))),
-            "These are positions in the list of pairs: indices of texts are asked for, from first and second.",
-        ),
-        Misconception(
-            "order-lost",
-            _choices(_by_winner),
-            "The pairs have changed their order: whatever else is known of each pair no longer belongs to it.",
-        ),
-        Misconception(
-            "int32",
-            after(ch96.repaired_choices, lambda pair: tuple(index.int() for index in pair)),
-            "Indices are int64, or they index nothing in older code.",
-        ),
-        in_place(ch96.repaired_choices, "first"),
-        Misconception("bad-input-accepted", _choices(_cut_to_the_shortest, checked=False), SHAPES),
+        *wrong(_WRONG_DECISIONS, _choices),
+        bad_input_accepted(_choices(rows_cut(ch96.repaired_choices), checked=False)),
     ),
     variants={
         "pair by pair in Python": _choices(_pair_by_pair),
         "gather": _choices(_by_gather),
         "sign of the difference": _choices(_by_sign),
-        "NumPy": _choices(lambda *given: tuple(_pairs_by_numpy(*given))),
-        "masks": _decided_by(lambda a, b: a > b, lambda a, b: a.ne(b)),
+        "NumPy": _choices(_pairs_by_numpy),
+        "masks": _choices(_decided(lambda a, b: a > b, lambda a, b: a.ne(b))),
     },
 )
 
