@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 
 import numpy as np
 import torch
@@ -67,6 +68,10 @@ def _zeroed(x, mask):
 def _last(mask):
     """True at each row's last kept token."""
     return mask & (mask.flip(1).cumsum(1).flip(1) == 1)
+
+
+def _nothing(x, *_rest):
+    return torch.zeros_like(x)
 
 
 def _listed(x, mask):
@@ -142,10 +147,7 @@ _WRONG_PER_TOKEN_LOGPS = {
         _table(lambda x: x.softmax(-1).log()),
         "The softmax of an unlikely token underflows to 0, whose logarithm is -inf: use log_softmax.",
     ),
-    "losses": (
-        _table(lambda x: -x.log_softmax(-1)),
-        "Cross-entropy is minus the log-probability: the sign is missing.",
-    ),
+    "losses": (_table(lambda x: -x.log_softmax(-1)), "Cross-entropy is minus the log-probability: the sign is missing."),
     "summed-over-the-text": (
         lambda x, i: ch95.per_token_logps(x, i).sum(1),
         "One number for each token is asked for, (B, L - 1).",
@@ -237,9 +239,8 @@ def _walk(input_ids, prompt_lengths, eos_token_id):
 
 
 _ROWS = ("input_ids", "prompt_lengths")
-_completions = versions_of(
-    ch95.completion_mask, satisfies(lambda input_ids, prompt_lengths: len(input_ids) == len(prompt_lengths))
-)
+_one_length_each = satisfies(lambda input_ids, prompt_lengths: len(input_ids) == len(prompt_lengths))
+_completions = versions_of(ch95.completion_mask, _one_length_each)
 
 
 def _kept_where(formula):
@@ -301,10 +302,7 @@ _WRONG_COMPLETION_MASK = {
         lambda e, t, s: _kept(e, t, s) & (t > s),
         "Column prompt_lengths[b] holds the completion's first token, and is kept.",
     ),
-    "one-start-for-all": (
-        lambda e, t, s: _kept(e, t, s[:1].expand_as(s)),
-        "Each row has a prompt length of its own.",
-    ),
+    "one-start-for-all": (lambda e, t, s: _kept(e, t, s[:1].expand_as(s)), "Each row has a prompt length of its own."),
     "all-but-end-tokens": (
         lambda e, t, s: (t >= s) & ~e,
         "Masking end tokens by their identity keeps what follows the first one, and drops that one itself.",
@@ -335,7 +333,7 @@ COMPLETION_MASK = Exercise(
     ),
     misconceptions=(
         *wrong(_WRONG_COMPLETION_MASK, lambda formula: _completions(_kept_where(formula))),
-        *wrong({"input-changed": (_prompts_overwritten, IN_PLACE)}, _completions),
+        Misconception("input-changed", _completions(_prompts_overwritten), IN_PLACE),
         bad_input_accepted(_completions(rows_cut(_kept_where(_kept)), checked=False)),
     ),
     variants={
@@ -365,6 +363,9 @@ def _penalised(generator, batch=5, length=8, kl_coef=0.1, shape="middle", spread
         "mask": mask,
         "kl_coef": kl_coef,
     }
+
+
+_AGREEING = altered(_penalised(), lambda drawn: {"ref_logps": drawn["logps"].clone()})
 
 
 def _penalised_by_loop(scores, logps, ref_logps, mask, kl_coef):
@@ -405,10 +406,7 @@ _WRONG_KL_PENALIZED_REWARDS = {
         _sum(penalty=lambda d, m, b: b * d),
         "Moving away from the reference is rewarded: the penalty is -kl_coef * (logps - ref_logps).",
     ),
-    "penalty-missing": (
-        _sum(penalty=lambda d, m, b: 0 * d),
-        "The score alone: nothing holds the policy near the reference.",
-    ),
+    "penalty-missing": (_sum(penalty=lambda d, m, b: 0 * d), "The score alone: nothing holds the policy near the reference."),
     "coefficient-missing": (_sum(penalty=lambda d, m, b: -d), "kl_coef is not used."),
     "penalty-summed-at-the-end": (
         _sum(penalty=lambda d, m, b: -b * _zeroed(d, m).sum(1, keepdim=True) * _last(m)),
@@ -463,11 +461,7 @@ KL_PENALIZED_REWARDS = Exercise(
         Case("completions that begin in the first column", _penalised(shape="left"), closed_form=_penalised_by_loop),
         Case("every token kept", _all_kept(_penalised(length=4)), closed_form=_penalised_by_loop),
         Case("kl_coef = 0: the score at the last token", _penalised(kl_coef=0.0), closed_form=_score_alone, visible=True),
-        Case(
-            "policy and reference agree",
-            altered(_penalised(), lambda drawn: {"ref_logps": drawn["logps"].clone()}),
-            closed_form=_score_alone,
-        ),
+        Case("policy and reference agree", _AGREEING, closed_form=_score_alone),
         Case("kl_coef = 2", _penalised(kl_coef=2.0), closed_form=_penalised_by_loop),
         Case("inputs that require gradient", _penalised(), differentiate=_PENALISED[:3], visible=True),
         Case("single precision", _penalised(), dtype=torch.float32, visible=True),
@@ -490,9 +484,7 @@ KL_PENALIZED_REWARDS = Exercise(
         "score at the last one of a reversed count": _rewards(_sum()),
         "scatter": _rewards(_scattered),
         "difference of two masks": _rewards(_sum(paid_at=lambda m: m & ~F.pad(m[:, 1:], (0, 1)))),
-        "in double precision": _rewards(
-            lambda s, new, old, m, b: _sum()(s.double(), new.double(), old.double(), m, b).to(new.dtype)
-        ),
+        "in double precision": _rewards(lambda s, new, old, m, b: _sum()(s.double(), new.double(), old, m, b).to(new.dtype)),
     },
 )
 
@@ -524,8 +516,7 @@ def _one_kept(generator):
 
 
 def _mean_by_list(x, mask):
-    kept = _listed(x, mask)
-    return torch.tensor(math.fsum(kept) / len(kept), dtype=x.dtype)
+    return torch.tensor(statistics.fmean(_listed(x, mask)), dtype=x.dtype)
 
 
 _masked = versions_of(ch95.masked_mean, one_shape(*_X))
@@ -589,8 +580,7 @@ _FAR_FROM_ZERO = altered(_entries(), lambda drawn: {"x": torch.where(drawn["mask
 def _by_list(x, mask, eps=1e-8, centred=True):
     """Whitened, or only scaled, one number at a time."""
     kept = _listed(x, mask)
-    mean = math.fsum(kept) / len(kept)
-    deviation = math.sqrt(math.fsum((value - mean) ** 2 for value in kept) / len(kept) + eps)
+    mean, deviation = statistics.fmean(kept), math.sqrt(statistics.pvariance(kept) + eps)
     entries = zip(x.flatten().tolist(), mask.flatten().tolist(), strict=True)
     scaled = [(value - mean * centred) / deviation if keep else 0.0 for value, keep in entries]
     return torch.tensor(scaled, dtype=x.dtype).reshape(x.shape)
@@ -630,10 +620,7 @@ def _by_sums(x, m, eps):
 _whitened = versions_of(ch95.masked_whiten, one_shape(*_X))
 
 _WRONG_STATISTICS = {
-    "statistics-over-padding": (
-        lambda x, m: (x.mean(), x.std()),
-        "Mean and deviation are taken over padding too. " + _OUTSIDE,
-    ),
+    "statistics-over-padding": (lambda x, m: (x.mean(), x.std()), "Mean and deviation are taken over padding too. " + _OUTSIDE),
     "padding-counted-as-zeros": (
         lambda x, m: (_zeroed(x, m).mean(), _zeroed(x, m).std()),
         "Padding is zeroed and then counted, which pulls the mean to 0: statistics are over kept entries only.",
@@ -678,7 +665,7 @@ MASKED_WHITEN = Exercise(
         Case("rows of very different lengths", _entries(), closed_form=_by_list, visible=True, draws=3),
         Case("scattered entries and an empty row", _scattered_entries, closed_form=_by_list, visible=True),
         Case("everything kept", _whole, closed_form=_by_list),
-        Case("equal entries: 0", _CONSTANT, closed_form=lambda x, mask: torch.zeros_like(x), visible=True),
+        Case("equal entries: 0", _CONSTANT, closed_form=_nothing, visible=True),
         Case("numbers far from 0", _FAR_FROM_ZERO, closed_form=_by_list),
         Case("single precision", _entries(), dtype=torch.float32, visible=True),
         *shape_cases(_entries(), _X),
@@ -722,6 +709,9 @@ def _true_values(generator):
     distance = (mask.flip(1).cumsum(1).flip(1) - 1).double()  # tokens left behind this one
     values = torch.where(mask, 0.9**distance, 5.0)
     return {"rewards": _last(mask).double(), "values": values, "mask": mask, "gamma": 0.9, "gae_lambda": 0.7}
+
+
+_AS_IN_PRACTICE = _tokens(gamma=1, gae_lambda=0.95)
 
 
 def _gae_by_sums(rewards, values, mask, gamma, gae_lambda):
@@ -817,10 +807,7 @@ _WRONG_MASKED_GAE = {
         "The mask is not used at all: neither the bootstrap, nor the recursion, nor the result knows where the text ends.",
     ),
     "padding-not-zeroed": (lambda r, v, m, g, lam: _scanned(_residuals(r, v, m, g), _decay(m, g, lam)), _ZERO),
-    "lambda-missing": (
-        _gae(decay=lambda m, g, lam: g * m),
-        "The recursion decays by gamma * gae_lambda: lambda is missing.",
-    ),
+    "lambda-missing": (_gae(decay=lambda m, g, lam: g * m), "The recursion decays by gamma * gae_lambda: lambda is missing."),
     "gamma-missing-in-recursion": (
         _gae(decay=lambda m, g, lam: lam * m),
         "The recursion decays by gamma * gae_lambda: gamma is missing.",
@@ -869,18 +856,8 @@ MASKED_GAE = Exercise(
         Case("gamma = 1, gae_lambda = 1: rewards to go minus values", _tokens(gamma=1, gae_lambda=1), closed_form=_rewards_to_go),
         Case("gae_lambda = 0: one-step residuals", _tokens(gae_lambda=0), closed_form=_gae_by_sums),
         Case("gamma = 0: reward minus value", _tokens(gamma=0), closed_form=_gae_by_sums),
-        Case(
-            "gamma = 1, gae_lambda = 0.95, as in practice",
-            _tokens(gamma=1, gae_lambda=0.95),
-            closed_form=_gae_by_sums,
-            visible=True,
-        ),
-        Case(
-            "true values leave nothing to explain",
-            _true_values,
-            closed_form=lambda rewards, **_rest: torch.zeros_like(rewards),
-            visible=True,
-        ),
+        Case("gamma = 1, gae_lambda = 0.95, as in practice", _AS_IN_PRACTICE, closed_form=_gae_by_sums, visible=True),
+        Case("true values leave nothing to explain", _true_values, closed_form=_nothing, visible=True),
         Case("inputs that require gradient", _tokens(), differentiate=_GAE[:2], visible=True),
         Case("single precision", _tokens(), dtype=torch.float32, visible=True),
         *shape_cases(_tokens(), _GAE),

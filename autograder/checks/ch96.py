@@ -226,10 +226,7 @@ _WRONG_REWARD_MODEL_LOSS = {
         lambda c, r, m: -F.logsigmoid(r - c - m).mean(),
         "The loss falls as the rejected text's score rises: the gap is chosen minus rejected.",
     ),
-    "sign-missing": (
-        lambda c, r, m: F.logsigmoid(c - r - m).mean(),
-        "log σ is to be maximised, a loss minimised: negate it.",
-    ),
+    "sign-missing": (lambda c, r, m: F.logsigmoid(c - r - m).mean(), "log σ is to be maximised, a loss minimised: negate it."),
     "sigmoid-without-logarithm": (
         lambda c, r, m: (1 - torch.sigmoid(c - r - m)).mean(),
         "This is the share of wrong answers to be expected, whose gradient vanishes where the model is most wrong: take -log σ.",
@@ -251,10 +248,7 @@ _WRONG_REWARD_MODEL_LOSS = {
         "The margin makes the task harder, not easier: the gap has to exceed it, so subtract it.",
     ),
     "margin-ignored": (lambda c, r, m: -F.logsigmoid(c - r).mean(), "margin is not used."),
-    "margin-averaged": (
-        lambda c, r, m: -F.logsigmoid(c - r - m.mean()).mean(),
-        "Each comparison has a margin of its own.",
-    ),
+    "margin-averaged": (lambda c, r, m: -F.logsigmoid(c - r - m.mean()).mean(), "Each comparison has a margin of its own."),
     "hinge": (
         lambda c, r, m: F.relu(1 - (c - r - m)).mean(),
         "This is a hinge loss: the Bradley-Terry model's likelihood is the sigmoid of the gap.",
@@ -267,10 +261,7 @@ _WRONG_REWARD_MODEL_LOSS = {
         lambda c, r, m: -F.logsigmoid(c - r - m).sum(),
         "A sum grows with the batch, and with it the step: take the mean.",
     ),
-    "not-averaged": (
-        lambda c, r, m: -F.logsigmoid(c - r - m),
-        "One number is asked for: the mean over the comparisons.",
-    ),
+    "not-averaged": (lambda c, r, m: -F.logsigmoid(c - r - m), "One number is asked for: the mean over the comparisons."),
     "logarithm-of-mean": (
         lambda c, r, m: -torch.sigmoid(c - r - m).mean().log(),
         "The logarithm of the mean probability: each comparison has a likelihood of its own, so take logarithms first.",
@@ -323,7 +314,7 @@ REWARD_MODEL_LOSS = Exercise(
         ),
         "binary cross-entropy": _loss(lambda c, r, m: F.binary_cross_entropy_with_logits(c - r - m, torch.ones_like(c))),
         "sum over count, in double precision": _loss(
-            lambda c, r, m: (-F.logsigmoid((c - r - m).double()).sum() / len(c)).to(c.dtype)
+            lambda c, r, m: -F.logsigmoid((c - r - m).double()).sum().to(c.dtype) / len(c)
         ),
     },
 )
@@ -431,20 +422,14 @@ _WRONG_BEST_OF_N_KL = {
         "(n - 1) / n is subtracted: at n = 1 either sign gives 0, at n = 2 it has to be log 2 - 1/2.",
     ),
     "base-two": (lambda n: math.log2(n) - (n - 1) / n, "log2 gives bits: nats are asked for."),
-    "one-over-n": (
-        lambda n: math.log(n) - 1 / n,
-        "The correction is (n - 1) / n: at n = 1 there is no choice and no KL.",
-    ),
+    "one-over-n": (lambda n: math.log(n) - 1 / n, "The correction is (n - 1) / n: at n = 1 there is no choice and no KL."),
     "not-divided": (lambda n: math.log(n) - (n - 1), "A KL is never negative: the correction is (n - 1) / n."),
     "n-plus-one": (lambda n: math.log(n) - (n - 1) / (n + 1), "The correction's denominator is n."),
     "the-wrong-way-round": (
         lambda n: n - 1 - math.log(n),
         "This is KL(policy ‖ best of n), the other direction: the expectation is over the best of n.",
     ),
-    "tensor": (
-        lambda n: torch.tensor(math.log(n) - (n - 1) / n),
-        "A Python float is asked for: nothing here is learnt.",
-    ),
+    "tensor": (lambda n: torch.tensor(math.log(n) - (n - 1) / n), "A Python float is asked for: nothing here is learnt."),
 }
 
 BEST_OF_N_KL = Exercise(
@@ -524,18 +509,12 @@ def _ranks(x):
 
 
 _WRONG_LENGTH_CORRELATION = {
-    "covariance": (
-        _covariance,
-        "This is the covariance, in units of score times tokens: divide by both standard deviations.",
-    ),
+    "covariance": (_covariance, "This is the covariance, in units of score times tokens: divide by both standard deviations."),
     "slope": (
         lambda a, b: _covariance(a, b) / _covariance(b, b),
         "This is the slope of a regression, score per token: divide by both standard deviations instead.",
     ),
-    "not-centred": (
-        _cosine,
-        "This is the cosine between two lists: subtract the means first, or any two positive lists agree.",
-    ),
+    "not-centred": (_cosine, "This is the cosine between two lists: subtract the means first, or any two positive lists agree."),
     "ranks": (
         lambda a, b: _pearson(_ranks(a), _ranks(b)),
         "This is Spearman's correlation, of ranks: Pearson's is of the values.",

@@ -57,6 +57,7 @@ def _one_token_each(generator):
 _TWO_TOKENS = replaced(_texts(3, 2), completion_mask=torch.tensor([[False, True]] * 3))
 _WHOLE_ROWS = reshaped(_texts(), "completion_mask", torch.ones_like)
 _NOTHING_KEPT = reshaped(_texts(), "completion_mask", lambda mask: mask.index_fill(0, torch.tensor([1]), False))
+_SHIFTED_MASK = reshaped(_texts(), "completion_mask", lambda mask: mask[:, 1:])
 _EVEN_ODDS = reshaped(_texts(), "logits", lambda logits: torch.full_like(logits, 3.0))
 _PREDICTING = altered(_texts(), lambda drawn: {"kept": F.pad(drawn["completion_mask"][:, 1:], (0, 1))})
 _LOUD = without(loud_padding(_PREDICTING, "logits", mask="kept"), "kept")  # the logits at t predict the token at t + 1
@@ -144,10 +145,7 @@ _WRONG_SEQUENCE_LOGPS = {
         _summed(lambda x: x.log_softmax(1)),
         "softmax is taken over positions: the probabilities of one position's tokens sum to 1, so use dim=-1.",
     ),
-    "probabilities-summed": (
-        _summed(lambda x: x.softmax(-1)),
-        "These are probabilities: take their logarithm before summing.",
-    ),
+    "probabilities-summed": (_summed(lambda x: x.softmax(-1)), "These are probabilities: take their logarithm before summing."),
     "logarithm-of-softmax": (
         _summed(lambda x: x.softmax(-1).log()),
         "The softmax of an unlikely token underflows to 0, whose logarithm is -inf: use log_softmax.",
@@ -172,12 +170,7 @@ SEQUENCE_LOGPS = Exercise(
         Case("gradient where what is not kept has logits of ±10,000", _LOUD, differentiate=["logits"]),
         Case("single precision", _texts(), dtype=torch.float32, visible=True),
         *shape_cases(_texts(), _TEXTS),
-        Case(
-            "completion_mask already shifted",
-            reshaped(_texts(), "completion_mask", lambda mask: mask[:, 1:]),
-            raises=_TEXTS,
-            visible=True,
-        ),
+        Case("completion_mask already shifted", _SHIFTED_MASK, raises=_TEXTS, visible=True),
     ),
     misconceptions=(
         *wrong(_WRONG_SEQUENCE_LOGPS, _sequence),
@@ -212,13 +205,8 @@ def _pairs(generator, batch=9, **scalars):
 
 def _ahead(chosen, rejected, batch=9, **scalars):
     """A policy whose log-ratios are these numbers, or vectors, exactly."""
-    return altered(
-        _pairs(batch, **scalars),
-        lambda drawn: {
-            "chosen_logps": drawn["ref_chosen_logps"] + chosen,
-            "rejected_logps": drawn["ref_rejected_logps"] + rejected,
-        },
-    )
+    ahead = {"chosen_logps": chosen, "rejected_logps": rejected}
+    return altered(_pairs(batch, **scalars), lambda drawn: {name: drawn[f"ref_{name}"] + by for name, by in ahead.items()})
 
 
 def _agreeing(**scalars):
@@ -245,8 +233,13 @@ def _dpo_by_formula(chosen_logps, rejected_logps, ref_chosen_logps, ref_rejected
     return tuple(torch.from_numpy(result).to(chosen_logps.dtype) for result in (losses, *rewards))
 
 
+def _each(value):
+    """A closed form where every pair's loss is known: this number."""
+    return lambda chosen_logps, **_rest: torch.full_like(chosen_logps, value)
+
+
 def _log_two(chosen_logps, **_rest):
-    return torch.full_like(chosen_logps, math.log(2)), torch.zeros_like(chosen_logps), torch.zeros_like(chosen_logps)
+    return tuple(torch.full_like(chosen_logps, value) for value in (math.log(2), 0.0, 0.0))
 
 
 _REFERENCE = "The reference is frozen: its log-probabilities are data, so detach them (or compute them under torch.no_grad())."
@@ -269,11 +262,11 @@ def _hand_softplus(x):
 
 def _dpo(loss=lambda gap, b, s: _smoothed(b * gap, s), gap=_gap, reward=lambda logps, ref, b: b * (logps - ref)):
     """A formula: `gap` of all four, `loss` of the gap, β and smoothing, `reward` of one completion's two and β."""
-    return lambda c, r, ref_c, ref_r, b, s: (
-        loss(gap(c, r, ref_c, ref_r), b, s),
-        reward(c, ref_c, b).detach(),
-        reward(r, ref_r, b).detach(),
-    )
+
+    def formula(c, r, ref_c, ref_r, b, s):
+        return loss(gap(c, r, ref_c, ref_r), b, s), reward(c, ref_c, b).detach(), reward(r, ref_r, b).detach()
+
+    return formula
 
 
 def _dpo_by_pairs(c, r, ref_c, ref_r, b, s):
@@ -292,10 +285,7 @@ _WRONG_DPO_LOSS = {
         "The loss falls as the rejected completion gets likelier: x is the chosen log-ratio minus the rejected one, and with"
         " label_smoothing the larger weight, 1 - s, goes with the label as given.",
     ),
-    "sign-missing": (
-        _dpo(lambda gap, b, s: -_smoothed(b * gap, s)),
-        "log σ is to be maximised, a loss minimised: negate it.",
-    ),
+    "sign-missing": (_dpo(lambda gap, b, s: -_smoothed(b * gap, s)), "log σ is to be maximised, a loss minimised: negate it."),
     "reference-ignored": (
         _dpo(gap=lambda c, r, ref_c, ref_r: c - r),
         "Without the reference nothing holds the policy near it, and pairs whose chosen text was likelier from the start are"
@@ -461,14 +451,8 @@ _WRONG_IPO_LOSS = {
         _ipo(lambda gap, b: (gap - b / 2) ** 2),
         "The target is 1 / (2 beta): a larger beta asks for a smaller margin.",
     ),
-    "target-of-a-half": (
-        _ipo(lambda gap, b: (gap - 0.5) ** 2),
-        "The target does not depend on beta here: it is 1 / (2 beta).",
-    ),
-    "no-target": (
-        _ipo(lambda gap, b: gap**2),
-        "This pulls the margin to 0, back to the reference: its target is 1 / (2 beta).",
-    ),
+    "target-of-a-half": (_ipo(lambda gap, b: (gap - 0.5) ** 2), "The target does not depend on beta here: it is 1 / (2 beta)."),
+    "no-target": (_ipo(lambda gap, b: gap**2), "This pulls the margin to 0, back to the reference: its target is 1 / (2 beta)."),
     "gap-scaled-by-beta": (
         _ipo(lambda gap, b: (b * gap - 0.5) ** 2),
         "This is beta² times the loss: the gap is not scaled in IPO, so that steps do not shrink with beta.",
@@ -506,17 +490,8 @@ IPO_LOSS = Exercise(
         Case("nine pairs, default beta", _pairs(), closed_form=_ipo_by_formula, visible=True, draws=3),
         Case("beta = 0.5", _pairs(beta=0.5), closed_form=_ipo_by_formula, visible=True),
         Case("beta = 2", _pairs(beta=2), closed_form=_ipo_by_formula),
-        Case(
-            "margins on target: 0",
-            _ahead(1.5, -0.5, beta=0.25),
-            closed_form=lambda chosen_logps, **_r: torch.zeros_like(chosen_logps),
-            visible=True,
-        ),
-        Case(
-            "policy and reference agree: 1 / (4 beta²)",
-            _agreeing(beta=0.25),
-            closed_form=lambda chosen_logps, **_r: torch.full_like(chosen_logps, 4.0),
-        ),
+        Case("margins on target: 0", _ahead(1.5, -0.5, beta=0.25), closed_form=_each(0.0), visible=True),
+        Case("policy and reference agree: 1 / (4 beta²)", _agreeing(beta=0.25), closed_form=_each(4.0)),
         Case("a single pair", _pairs(1), closed_form=_ipo_by_formula),
         Case("all inputs require gradient", _pairs(beta=0.3), differentiate=LOGPS, visible=True, draws=3),
         Case("single precision", _pairs(beta=0.5), dtype=torch.float32, visible=True),
@@ -596,45 +571,45 @@ def _prompt_by_prompt(p, r, beta):
 
 _WRONG_KL_OPTIMAL_POLICY = {
     "reference-ignored": (
-        lambda p, r, beta: (r / beta).softmax(-1),
+        lambda p, r, b: (r / b).softmax(-1),
         "This is the optimum for a uniform reference: each weight exp(r / beta) is multiplied by π_ref.",
     ),
     "reference-not-in-logarithms": (
-        lambda p, r, beta: (p + r / beta).softmax(-1),
+        lambda p, r, b: (p + r / b).softmax(-1),
         "Inside the softmax stand logarithms: add log π_ref, not π_ref.",
     ),
     "beta-multiplies": (
-        lambda p, r, beta: (p.log() + r * beta).softmax(-1),
+        lambda p, r, b: (p.log() + r * b).softmax(-1),
         "A larger beta keeps the policy closer to the reference: rewards are divided by it.",
     ),
-    "beta-missing": (lambda p, r, beta: (p.log() + r).softmax(-1), "beta is not used."),
+    "beta-missing": (lambda p, r, b: (p.log() + r).softmax(-1), "beta is not used."),
     "reference-tempered": (
-        lambda p, r, beta: ((p.log() + r) / beta).softmax(-1),
+        lambda p, r, b: ((p.log() + r) / b).softmax(-1),
         "Only the reward is divided by beta: the reference stands with exponent 1.",
     ),
     "reward-sign-flipped": (
-        lambda p, r, beta: (p.log() - r / beta).softmax(-1),
+        lambda p, r, b: (p.log() - r / b).softmax(-1),
         "High rewards become unlikely: the exponent is +r / beta.",
     ),
     "not-normalised": (
-        lambda p, r, beta: p * (r / beta).exp(),
+        lambda p, r, b: p * (r / b).exp(),
         "The weights do not sum to 1: divide by Z, their sum over the last axis.",
     ),
     "normalised-over-everything": (
-        lambda p, r, beta: (p.log() + r / beta).flatten().softmax(0).reshape(p.shape),
+        lambda p, r, b: (p.log() + r / b).flatten().softmax(0).reshape(p.shape),
         "Each prompt has its own Z: sum over the last axis only.",
     ),
     "overflow": (
-        lambda p, r, beta: p * (r / beta).exp() / (p * (r / beta).exp()).sum(-1, keepdim=True),
+        lambda p, r, b: p * (r / b).exp() / (p * (r / b).exp()).sum(-1, keepdim=True),
         "exp(r / beta) overflows, and inf / inf is not a number: subtract the largest exponent first, as softmax does.",
     ),
     "impossible-made-possible": (
-        lambda p, r, beta: ((p + 1e-10).log() + r / beta).softmax(-1),
+        lambda p, r, b: ((p + 1e-10).log() + r / b).softmax(-1),
         "A small number added to π_ref opens answers that the reference never gives, and a large reward finds them: log 0 = -inf"
         " is what softmax needs.",
     ),
     "greedy": (
-        lambda p, r, beta: F.one_hot((p.log() + r / beta).argmax(-1), p.shape[-1]).to(p.dtype),
+        lambda p, r, b: F.one_hot((p.log() + r / b).argmax(-1), p.shape[-1]).to(p.dtype),
         "This is the best single answer: the optimum with a KL penalty keeps every answer's share.",
     ),
 }
@@ -668,11 +643,9 @@ KL_OPTIMAL_POLICY = Exercise(
         "weights, largest taken out": _optimal(_tilted),
         "NumPy": _optimal(_tilted_by_numpy),
         "prompt by prompt": _optimal(_prompt_by_prompt),
-        "logsumexp": _optimal(
-            lambda p, r, beta: torch.exp(p.log() + r / beta - torch.logsumexp(p.log() + r / beta, dim=-1, keepdim=True))
-        ),
+        "logsumexp": _optimal(lambda p, r, b: (p.log() + r / b - (p.log() + r / b).logsumexp(-1, keepdim=True)).exp()),
         "relative to the mean, in double precision": _optimal(
-            lambda p, r, beta: (p.double().log() + (r - r.mean(-1, keepdim=True)).double() / beta).softmax(-1).to(p.dtype)
+            lambda p, r, b: (p.double().log() + (r - r.mean(-1, keepdim=True)).double() / b).softmax(-1).to(p.dtype)
         ),
     },
 )
@@ -697,9 +670,8 @@ def _walk(attention_mask, prompt_tokens):
 
 
 _ROWS = ("attention_mask", "prompt_tokens")
-_repaired = versions_of(
-    ch97.repaired_completion_mask, satisfies(lambda attention_mask, prompt_tokens: len(attention_mask) == len(prompt_tokens))
-)
+_one_row_each = satisfies(lambda attention_mask, prompt_tokens: len(attention_mask) == len(prompt_tokens))
+_repaired = versions_of(ch97.repaired_completion_mask, _one_row_each)
 
 
 def _counting(formula):
@@ -729,10 +701,7 @@ _WRONG_PLACES = {
         lambda m, t, p: m & (t > p),
         "The first written token is missing: the policy chose it, and the prompt's last position predicts it.",
     ),
-    "mask-inverted": (
-        lambda m, t, p: ~(m & (t >= p)),
-        "True marks the tokens that count: this keeps all the others.",
-    ),
+    "mask-inverted": (lambda m, t, p: ~(m & (t >= p)), "True marks the tokens that count: this keeps all the others."),
     "one-prompt-length-for-all": (
         lambda m, t, p: m & (t >= p.min()),
         "Each text has a prompt length of its own: here the shortest is used for all.",
