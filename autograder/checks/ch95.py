@@ -90,10 +90,8 @@ _ROW_MEANS = (
 
 @drawing
 def _logits(generator, batch=3, length=6, vocabulary=7, scale=2.0):
-    return {
-        "logits": scale * normal(generator, batch, length, vocabulary),
-        "input_ids": integers(generator, 0, vocabulary, batch, length),
-    }
+    logits = scale * normal(generator, batch, length, vocabulary)
+    return {"logits": logits, "input_ids": integers(generator, 0, vocabulary, batch, length)}
 
 
 def _token_by_token(logits, input_ids):
@@ -204,12 +202,8 @@ END = 2
 def _sampled(generator, batch=6, length=10, end_rate=0.2, start=(2, 6), eos_token_id=END):
     """Prompts of several lengths, tokens at random among which are end tokens, also in prompts."""
     ordinary = integers(generator, 3, 50, batch, length)
-    ends = torch.rand(batch, length, generator=generator) < end_rate
-    return {
-        "input_ids": torch.where(ends, END, ordinary),
-        "prompt_lengths": integers(generator, *start, batch),
-        "eos_token_id": eos_token_id,
-    }
+    ids = torch.where(torch.rand(batch, length, generator=generator) < end_rate, END, ordinary)
+    return {"input_ids": ids, "prompt_lengths": integers(generator, *start, batch), "eos_token_id": eos_token_id}
 
 
 def _ended(where):
@@ -353,16 +347,11 @@ COMPLETION_MASK = Exercise(
 
 
 @drawing
-def _penalised(generator, batch=5, length=8, kl_coef=0.1, shape="middle", spread=1.0):
+def _penalised(generator, batch=5, length=8, kl_coef=0.1, shape="middle"):
     mask = _mask(generator, batch, length, shape)
-    logps = -2 + normal(generator, batch, length)
-    return {
-        "scores": 1 + 2 * normal(generator, batch),
-        "logps": logps,
-        "ref_logps": _garbage(mask, logps + spread * normal(generator, batch, length)),
-        "mask": mask,
-        "kl_coef": kl_coef,
-    }
+    logps, scores = -2 + normal(generator, batch, length), 1 + 2 * normal(generator, batch)
+    ref_logps = _garbage(mask, logps + normal(generator, batch, length))
+    return {"scores": scores, "logps": logps, "ref_logps": ref_logps, "mask": mask, "kl_coef": kl_coef}
 
 
 _AGREEING = altered(_penalised(), lambda drawn: {"ref_logps": drawn["logps"].clone()})
@@ -383,12 +372,8 @@ def _score_alone(scores, mask, **_rest):
 
 
 _PENALISED = ("scores", "logps", "ref_logps", "mask")
-_rewards = versions_of(
-    ch95.kl_penalized_rewards,
-    one_shape(*_PENALISED[1:]),
-    satisfies(lambda scores, logps: scores.shape == logps.shape[:1]),
-    data=_PENALISED[:3],
-)
+_one_score_each = satisfies(lambda scores, logps: scores.shape == logps.shape[:1])
+_rewards = versions_of(ch95.kl_penalized_rewards, one_shape(*_PENALISED[1:]), _one_score_each, data=_PENALISED[:3])
 
 
 def _sum(penalty=lambda d, m, b: -b * d, paid_at=_last):
@@ -592,16 +577,15 @@ def _std(kept):
 
 def _of_rows(statistic, x, mask):
     """A statistic of each row's kept entries, (B, 1)."""
-    return torch.stack([statistic(row[kept]) if kept.any() else row.sum() * 0 for row, kept in zip(x, mask, strict=True)])[
-        :, None
-    ]
+    rows = [statistic(row[kept]) if kept.any() else 0 * row.sum() for row, kept in zip(x, mask, strict=True)]
+    return torch.stack(rows)[:, None]
 
 
-def _scaled_by(statistics):
-    """A formula: `statistics`, of entries and mask, are what is subtracted and what divides."""
+def _scaled_by(moments):
+    """A formula: `moments`, of entries and mask, are what is subtracted and what divides."""
 
     def formula(x, m, eps):
-        centre, deviation = statistics(x, m)
+        centre, deviation = moments(x, m)
         return _zeroed((x - centre) / (deviation + eps), m)
 
     return formula
@@ -619,7 +603,7 @@ def _by_sums(x, m, eps):
 
 _whitened = versions_of(ch95.masked_whiten, one_shape(*_X))
 
-_WRONG_STATISTICS = {
+_WRONG_MOMENTS = {
     "statistics-over-padding": (lambda x, m: (x.mean(), x.std()), "Mean and deviation are taken over padding too. " + _OUTSIDE),
     "padding-counted-as-zeros": (
         lambda x, m: (_zeroed(x, m).mean(), _zeroed(x, m).std()),
@@ -671,7 +655,7 @@ MASKED_WHITEN = Exercise(
         *shape_cases(_entries(), _X),
     ),
     misconceptions=(
-        *wrong(_WRONG_STATISTICS, lambda statistics: _whitened(_scaled_by(statistics))),
+        *wrong(_WRONG_MOMENTS, lambda moments: _whitened(_scaled_by(moments))),
         *wrong(_WRONG_WHITENING, _whitened),
         dtype_lost(ch95.masked_whiten),
         in_place(ch95.masked_whiten, "x"),
@@ -694,13 +678,8 @@ MASKED_WHITEN = Exercise(
 @drawing
 def _tokens(generator, batch=5, length=8, shape="middle", gamma=0.9, gae_lambda=0.8, padding=1000):
     mask = _mask(generator, batch, length, shape)
-    return {
-        "rewards": _garbage(mask, normal(generator, batch, length), padding),
-        "values": _garbage(mask, normal(generator, batch, length), padding),
-        "mask": mask,
-        "gamma": gamma,
-        "gae_lambda": gae_lambda,
-    }
+    rewards, values = (_garbage(mask, normal(generator, batch, length), padding) for _ in range(2))
+    return {"rewards": rewards, "values": values, "mask": mask, "gamma": gamma, "gae_lambda": gae_lambda}
 
 
 def _true_values(generator):
@@ -732,13 +711,8 @@ def _rewards_to_go(rewards, values, mask, gamma, gae_lambda):
 
 
 _GAE = ("rewards", "values", "mask")
-_advantages = versions_of(
-    ch95.masked_gae,
-    one_shape(*_GAE),
-    satisfies(lambda gamma: 0 <= gamma <= 1),
-    satisfies(lambda gae_lambda: 0 <= gae_lambda <= 1),
-    data=_GAE[:2],
-)
+_in_range = satisfies(lambda gamma, gae_lambda: 0 <= gamma <= 1 and 0 <= gae_lambda <= 1)
+_advantages = versions_of(ch95.masked_gae, one_shape(*_GAE), _in_range, data=_GAE[:2])
 
 
 def _behind(x):
@@ -897,13 +871,10 @@ def _epoch(generator, batch=5, length=7, spread=0.35, shape="middle", **scalars)
     """A policy some steps away from the one that sampled; rows of 1 and of many tokens."""
     mask = _uneven_mask(generator, batch, length, shape)
     old_logps = -2 + normal(generator, batch, length)
-    log_ratio = _off_bounds(spread * normal(generator, batch, length), scalars.get("clip_range", 0.2))
-    return {
-        "logps": old_logps + log_ratio,
-        "old_logps": torch.where(mask, old_logps, old_logps - 3),
-        "advantages": _garbage(mask, 0.3 + normal(generator, batch, length)),
-        "mask": mask,
-    } | scalars
+    logps = old_logps + _off_bounds(spread * normal(generator, batch, length), scalars.get("clip_range", 0.2))
+    advantages = _garbage(mask, 0.3 + normal(generator, batch, length))
+    old_logps = torch.where(mask, old_logps, old_logps - 3)
+    return {"logps": logps, "old_logps": old_logps, "advantages": advantages, "mask": mask} | scalars
 
 
 def _one_far_ratio(generator):
@@ -1150,7 +1121,7 @@ REPAIRED_REWARD_SCALING = Exercise(
         *shape_cases(_paid(), ("rewards", "mask")),
     ),
     misconceptions=(
-        *wrong(_WRONG_SHIFTS_AND_SCALES, lambda statistics: _scaled(_scaled_by(statistics))),
+        *wrong(_WRONG_SHIFTS_AND_SCALES, lambda moments: _scaled(_scaled_by(moments))),
         *wrong(_WRONG_SCALING, _scaled),
         dtype_lost(ch95.repaired_reward_scaling),
         in_place(ch95.repaired_reward_scaling, "rewards"),

@@ -181,7 +181,6 @@ def _with_margins(generator, batch=9, least=0.0):
     return _plain(batch)(generator) | {"margin": least + normal(generator, batch).abs()}
 
 
-@drawing
 def _far(generator):
     """Scores 1,000 apart, either way."""
     side = torch.tensor([1.0, -1.0, 1.0, -1.0], dtype=torch.float64)
@@ -189,7 +188,6 @@ def _far(generator):
     return {"chosen_scores": base + 500 * side, "rejected_scores": base - 500 * side}
 
 
-@drawing
 def _undecided(generator):
     """A reward model that has not learnt anything: all its scores are equal."""
     chosen = normal(generator, 6)
@@ -204,12 +202,8 @@ def _loss_by_numpy(chosen_scores, rejected_scores, margin=None):
     return torch.tensor(np.logaddexp(0, -gaps).mean())
 
 
-_compared = versions_of(
-    ch96.reward_model_loss,
-    one_shape(*_SCORES),
-    satisfies(lambda margin, chosen_scores: margin is None or margin.shape == chosen_scores.shape),
-    data=["margin"],
-)
+_margin_fits = satisfies(lambda margin, chosen_scores: margin is None or margin.shape == chosen_scores.shape)
+_compared = versions_of(ch96.reward_model_loss, one_shape(*_SCORES), _margin_fits, data=["margin"])
 
 
 def _loss(formula, **options):
@@ -280,14 +274,14 @@ REWARD_MODEL_LOSS = Exercise(
         Case("nine comparisons", _plain(), closed_form=_loss_by_numpy, visible=True, draws=3),
         Case("with margins", _with_margins(), closed_form=_loss_by_numpy, visible=True, draws=3),
         Case("margin=None, said aloud", replaced(_plain(), margin=None), closed_form=_loss_by_numpy),
-        Case("equal scores: log 2", _undecided(), closed_form=number(math.log(2)), visible=True),
+        Case("equal scores: log 2", _undecided, closed_form=number(math.log(2)), visible=True),
         Case("gaps equal to the margins: log 2", _MARGIN_REACHED, closed_form=number(math.log(2))),
-        Case("scores 1,000 apart", _far(), closed_form=_loss_by_numpy, visible=True),
+        Case("scores 1,000 apart", _far, closed_form=_loss_by_numpy, visible=True),
         Case("one comparison with a margin", _with_margins(1, least=0.5), closed_form=_loss_by_numpy),
         Case("scores that require gradient", _plain(), differentiate=_SCORES, visible=True),
         Case("everything requires gradient", _with_margins(), differentiate=_ALL, visible=True, draws=3),
-        Case("gradient where scores are equal", _undecided(), differentiate=_SCORES, visible=True),
-        Case("gradient where scores are 1,000 apart", _far(), differentiate=_SCORES),
+        Case("gradient where scores are equal", _undecided, differentiate=_SCORES, visible=True),
+        Case("gradient where scores are 1,000 apart", _far, differentiate=_SCORES),
         Case("single precision", _with_margins(), dtype=torch.float32, visible=True),
         *shape_cases(_with_margins(), _ALL),
         Case("rejected_scores as a column", _as_column(_plain(), "rejected_scores"), raises=_SCORES),
@@ -309,9 +303,7 @@ REWARD_MODEL_LOSS = Exercise(
     variants={
         "softplus": _loss(lambda c, r, m: F.softplus(r + m - c).mean()),
         "softmax of two": _loss(lambda c, r, m: -torch.stack([c - m, r]).log_softmax(0)[0].mean()),
-        "comparison by comparison": _loss(
-            lambda c, r, m: sum(torch.logaddexp(x, y) - x for x, y in zip(c - m, r, strict=True)) / len(c)
-        ),
+        "comparison by comparison": _loss(lambda c, r, m: torch.stack([-F.logsigmoid(gap) for gap in c - r - m]).mean()),
         "binary cross-entropy": _loss(lambda c, r, m: F.binary_cross_entropy_with_logits(c - r - m, torch.ones_like(c))),
         "sum over count, in double precision": _loss(
             lambda c, r, m: -F.logsigmoid((c - r - m).double()).sum().to(c.dtype) / len(c)

@@ -76,10 +76,8 @@ def _by_token(logits, input_ids, completion_mask):
 
 
 _TEXTS = ("logits", "input_ids", "completion_mask")
-_sequence = versions_of(
-    ch97.sequence_logps,
-    satisfies(lambda logits, input_ids, completion_mask: logits.shape[:2] == input_ids.shape == completion_mask.shape),
-)
+_aligned = satisfies(lambda logits, input_ids, completion_mask: logits.shape[:2] == input_ids.shape == completion_mask.shape)
+_sequence = versions_of(ch97.sequence_logps, _aligned)
 
 
 def _chosen(table, ids):
