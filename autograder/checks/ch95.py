@@ -478,10 +478,9 @@ KL_PENALIZED_REWARDS = Exercise(
 _X = ("x", "mask")
 
 
-@drawing
-def _entries(generator, batch=4, length=7, shape="middle"):
-    mask = _uneven_mask(generator, batch, length, shape)
-    return {"x": _garbage(mask, 0.5 + normal(generator, batch, length)), "mask": mask}
+def _entries(generator):
+    mask = _uneven_mask(generator, 4, 7)
+    return {"x": _garbage(mask, 0.5 + normal(generator, 4, 7)), "mask": mask}
 
 
 def _scattered_entries(generator):
@@ -513,16 +512,10 @@ _WRONG_MASKED_MEAN = {
         "The sum is over kept entries, and so is the count: here the sum is divided by the size of the whole tensor.",
     ),
     "mean-of-row-means": (lambda x, m: (_zeroed(x, m).sum(1) / m.sum(1).clamp(min=1)).mean(), _ROW_MEANS),
-    "one-mean-for-each-row": (
-        lambda x, m: _zeroed(x, m).sum(1) / m.sum(1).clamp(min=1),
-        "One number for the whole batch is asked for.",
-    ),
+    "one-mean-for-each-row": (lambda x, m: _zeroed(x, m).sum(1) / m.sum(1), "One number for the whole batch is asked for."),
     "sum": (lambda x, m: x[m].sum(), "Divide by the number of kept entries."),
     "divided-by-rows": (lambda x, m: x[m].sum() / len(x), "Divide by the number of kept entries, not of rows."),
-    "mask-inverted": (
-        lambda x, m: _zeroed(x, ~m).sum() / (~m).sum().clamp(min=1),
-        "True means keep: the mask is the wrong way round.",
-    ),
+    "mask-inverted": (lambda x, m: x[~m].mean(), "True means keep: the mask is the wrong way round."),
     "count-off-by-a-constant": (
         lambda x, m: x[m].sum() / (m.sum() + 1),
         "A constant in the denominator biases small counts: divide by the number of kept entries.",
@@ -534,13 +527,13 @@ MASKED_MEAN = Exercise(
     reference=ch95.masked_mean,
     criteria={"values": 0.7, "dtype": 0.1, "inputs": 0.1, "errors": 0.1},
     cases=drawn_once(
-        Case("rows of very different lengths", _entries(), closed_form=_mean_by_list, visible=True, draws=3),
+        Case("rows of very different lengths", _entries, closed_form=_mean_by_list, visible=True, draws=3),
         Case("scattered entries and an empty row", _scattered_entries, closed_form=_mean_by_list, visible=True),
         Case("everything kept", _whole, closed_form=_mean_by_list),
         Case("one entry kept", _one_kept, closed_form=_mean_by_list, visible=True),
-        Case("zeros among the kept entries", reshaped(_entries(), "x", lambda x: x.clamp(min=0)), closed_form=_mean_by_list),
-        Case("single precision", _entries(), dtype=torch.float32, visible=True),
-        *shape_cases(_entries(), _X),
+        Case("zeros among the kept entries", reshaped(_entries, "x", lambda x: x.clamp(min=0)), closed_form=_mean_by_list),
+        Case("single precision", _entries, dtype=torch.float32, visible=True),
+        *shape_cases(_entries, _X),
     ),
     misconceptions=(
         *wrong(_WRONG_MASKED_MEAN, _masked),
@@ -558,8 +551,8 @@ MASKED_MEAN = Exercise(
     },
 )
 
-_CONSTANT = altered(_entries(), lambda drawn: {"x": _garbage(drawn["mask"], torch.full_like(drawn["x"], 3.0))})
-_FAR_FROM_ZERO = altered(_entries(), lambda drawn: {"x": torch.where(drawn["mask"], drawn["x"].sign() * 4 + 1e4, drawn["x"])})
+_CONSTANT = altered(_entries, lambda drawn: {"x": _garbage(drawn["mask"], torch.full_like(drawn["x"], 3.0))})
+_FAR_FROM_ZERO = altered(_entries, lambda drawn: {"x": torch.where(drawn["mask"], drawn["x"].sign() * 4 + 1e4, drawn["x"])})
 
 
 def _by_list(x, mask, eps=1e-8, centred=True):
@@ -616,7 +609,7 @@ _WRONG_MOMENTS = {
     "not-centred": (lambda x, m: (0, _std(x[m])), "Subtract the mean of the kept entries as well."),
     "only-centred": (lambda x, m: (x[m].mean(), 1), "Divide by the standard deviation of the kept entries as well."),
     "divided-by-variance": (
-        lambda x, m: (x[m].mean(), x[m].var(correction=0)),
+        lambda x, m: (x[m].mean(), _std(x[m]) ** 2),
         "Divide by the standard deviation, the root of the variance.",
     ),
     "deviation-not-around-the-mean": (
@@ -646,13 +639,13 @@ MASKED_WHITEN = Exercise(
     criteria={"values": 0.95, "dtype": 0.1, "inputs": 0.1, "errors": 0.1},
     axes=("text", "t"),
     cases=drawn_once(
-        Case("rows of very different lengths", _entries(), closed_form=_by_list, visible=True, draws=3),
+        Case("rows of very different lengths", _entries, closed_form=_by_list, visible=True, draws=3),
         Case("scattered entries and an empty row", _scattered_entries, closed_form=_by_list, visible=True),
         Case("everything kept", _whole, closed_form=_by_list),
         Case("equal entries: 0", _CONSTANT, closed_form=_nothing, visible=True),
         Case("numbers far from 0", _FAR_FROM_ZERO, closed_form=_by_list),
-        Case("single precision", _entries(), dtype=torch.float32, visible=True),
-        *shape_cases(_entries(), _X),
+        Case("single precision", _entries, dtype=torch.float32, visible=True),
+        *shape_cases(_entries, _X),
     ),
     misconceptions=(
         *wrong(_WRONG_MOMENTS, lambda moments: _whitened(_scaled_by(moments))),
@@ -810,10 +803,7 @@ _WRONG_MASKED_GAE = {
         _gae_forwards,
         "The recursion runs forwards: a token is credited for what came before it. Begin at the last token.",
     ),
-    "returns": (
-        lambda r, v, m, g, lam: _gae()(r, v, m, g, lam) + _zeroed(v, m),
-        "These are the returns, advantages plus values.",
-    ),
+    "returns": (lambda r, v, m, *rest: _gae()(r, v, m, *rest) + _zeroed(v, m), "These are the returns, advantages plus values."),
 }
 
 MASKED_GAE = Exercise(
@@ -867,9 +857,9 @@ def _off_bounds(log_ratio, clip_range):
 
 
 @drawing
-def _epoch(generator, batch=5, length=7, spread=0.35, shape="middle", **scalars):
+def _epoch(generator, batch=5, length=7, spread=0.35, **scalars):
     """A policy some steps away from the one that sampled; rows of 1 and of many tokens."""
-    mask = _uneven_mask(generator, batch, length, shape)
+    mask = _uneven_mask(generator, batch, length)
     old_logps = -2 + normal(generator, batch, length)
     logps = old_logps + _off_bounds(spread * normal(generator, batch, length), scalars.get("clip_range", 0.2))
     advantages = _garbage(mask, 0.3 + normal(generator, batch, length))
@@ -914,7 +904,7 @@ def _ratio(new, old):
     return (new - old).exp()
 
 
-def _surrogate(objective=_clipped, mean=_mean, ratio=_ratio):
+def _loss(objective=_clipped, mean=_mean, ratio=_ratio):
     """A formula: `objective` of ratios, advantages and range, `mean` of the terms and the mask; padding is set to 0 before."""
     return lambda new, old, a, m, e: mean(objective(ratio(_zeroed(new, m), _zeroed(old, m)), _zeroed(a, m), e), m)
 
@@ -930,17 +920,17 @@ def _excess(r, a, e):
 
 
 _WRONG_PPO_TOKEN_LOSS = {
-    "mean-of-row-means": (_surrogate(mean=lambda terms, m: (_zeroed(terms, m).sum(1) / m.sum(1)).mean()), _ROW_MEANS),
+    "mean-of-row-means": (_loss(mean=lambda terms, m: (_zeroed(terms, m).sum(1) / m.sum(1)).mean()), _ROW_MEANS),
     "divided-by-everything": (
-        _surrogate(mean=lambda terms, m: _zeroed(terms, m).mean()),
+        _loss(mean=lambda terms, m: _zeroed(terms, m).mean()),
         "The sum is over kept tokens, and so is the count: here it is divided by the size of the whole batch with its padding.",
     ),
     "summed-over-tokens": (
-        _surrogate(mean=lambda terms, m: _zeroed(terms, m).sum(1).mean()),
+        _loss(mean=lambda terms, m: _zeroed(terms, m).sum(1).mean()),
         "A sum over each text, averaged over texts, weighs with the length: take the mean over all kept tokens.",
     ),
     "ratio-of-sequences": (
-        _surrogate(ratio=lambda new, old: (new - old).sum(1, keepdim=True).exp().expand_as(new)),
+        _loss(ratio=lambda new, old: (new - old).sum(1, keepdim=True).exp().expand_as(new)),
         "One ratio for the whole text, the product over its tokens, leaves the clip's interval almost at once: each token has its own.",
     ),
     "ratio-of-padding": (
@@ -948,25 +938,19 @@ _WRONG_PPO_TOKEN_LOSS = {
         "The value is right and the gradient NaN: the ratio is formed for padding, too, where exp overflows, and infinity times the"
         " mask's 0 is NaN on the way back. Leave padding out before exp, as in (logps - old_logps)[mask].",
     ),
-    "sign-missing": (
-        _surrogate(lambda r, a, e: -_clipped(r, a, e)),
-        "The objective is to be maximised, a loss minimised: negate it.",
-    ),
-    "not-clipped": (_surrogate(lambda r, a, e: -r * a), "Nothing is clipped."),
+    "sign-missing": (_loss(lambda r, a, e: -_clipped(r, a, e)), "The objective is to be maximised, a loss minimised: negate it."),
+    "not-clipped": (_loss(lambda r, a, e: -r * a), "Nothing is clipped."),
     "clipped-only": (
-        _surrogate(lambda r, a, e: -r.clamp(1 - e, 1 + e) * a),
+        _loss(lambda r, a, e: -r.clamp(1 - e, 1 + e) * a),
         "The minimum with the unclipped term is missing: tokens on the wrong side of the interval get no gradient back.",
     ),
     "maximum-instead-of-minimum": (
-        _surrogate(lambda r, a, e: -torch.maximum(r * a, r.clamp(1 - e, 1 + e) * a)),
+        _loss(lambda r, a, e: -torch.maximum(r * a, r.clamp(1 - e, 1 + e) * a)),
         "The minimum of the two objectives is the pessimistic one (of the two losses, the maximum).",
     ),
-    "ratio-inverted": (
-        _surrogate(ratio=lambda new, old: (old - new).exp()),
-        "The ratio is new over old: exp(logps - old_logps).",
-    ),
+    "ratio-inverted": (_loss(ratio=lambda new, old: (old - new).exp()), "The ratio is new over old: exp(logps - old_logps)."),
     "log-ratio": (
-        _surrogate(lambda r, a, e: -torch.minimum(r.log() * a, r.log().clamp(-e, e) * a)),
+        _loss(lambda r, a, e: -torch.minimum(r.log() * a, r.log().clamp(-e, e) * a)),
         "This is the log-ratio: take its exponential.",
     ),
     "policy-gradient": (
@@ -974,7 +958,7 @@ _WRONG_PPO_TOKEN_LOSS = {
         "This is the plain policy gradient, right for a single step: the ratio to the sampling policy is missing.",
     ),
     "clip-range-ignored": (
-        _surrogate(lambda r, a, e: _clipped(r, a, 0.2)),
+        _loss(lambda r, a, e: _clipped(r, a, 0.2)),
         "The range is 0.2 whatever the caller says: use clip_range.",
     ),
     "advantages-whitened-inside": (
@@ -1021,20 +1005,20 @@ PPO_TOKEN_LOSS = Exercise(
     ),
     misconceptions=(
         *wrong(_WRONG_PPO_TOKEN_LOSS, _ppo),
-        *wrong(_LEAKS, lambda leaking: leaking(_surrogate())),
+        *wrong(_LEAKS, lambda leaking: leaking(_loss())),
         python_float(ch95.ppo_token_loss),
         cut_from_graph(ch95.ppo_token_loss),
         dtype_lost(ch95.ppo_token_loss),
         in_place(ch95.ppo_token_loss, "logps"),
-        bad_input_accepted(_ppo(rows_cut(_surrogate()), checked=False)),
+        bad_input_accepted(_ppo(rows_cut(_loss()), checked=False)),
     ),
     variants={
-        "maximum of the losses": _ppo(_surrogate(lambda r, a, e: torch.maximum(-r * a, -r.clamp(1 - e, 1 + e) * a))),
-        "by conditions": _ppo(_surrogate(_by_conditions)),
-        "excess past the bound": _ppo(_surrogate(_excess)),
-        "sum over count": _ppo(_surrogate(mean=lambda terms, m: _zeroed(terms, m).sum() / m.sum())),
+        "maximum of the losses": _ppo(_loss(lambda r, a, e: torch.maximum(-r * a, -r.clamp(1 - e, 1 + e) * a))),
+        "by conditions": _ppo(_loss(_by_conditions)),
+        "excess past the bound": _ppo(_loss(_excess)),
+        "sum over count": _ppo(_loss(mean=lambda terms, m: _zeroed(terms, m).sum() / m.sum())),
         "weights of 1 / count, in double precision": _ppo(
-            _surrogate(mean=lambda terms, m: (terms.double() * (m.double() / m.sum())).sum().to(terms.dtype))
+            _loss(mean=lambda terms, m: (terms.double() * (m.double() / m.sum())).sum().to(terms.dtype))
         ),
     },
 )
@@ -1079,10 +1063,7 @@ _WRONG_SHIFTS_AND_SCALES = {
         lambda r, m: (0, r[m].square().mean().sqrt()),
         "This is the root mean square: the deviation is taken around the mean, although the mean is not subtracted from the rewards.",
     ),
-    "divided-by-variance": (
-        lambda r, m: (0, r[m].var(correction=0)),
-        "Divide by the standard deviation, the root of the variance.",
-    ),
+    "divided-by-variance": (lambda r, m: (0, _std(r[m]) ** 2), "Divide by the standard deviation, the root of the variance."),
     "deviation-over-padding": (lambda r, m: (0, r.std()), "The deviation is taken over padding too. " + _OUTSIDE),
     "padding-counted-as-zeros": (
         lambda r, m: (0, _zeroed(r, m).std()),

@@ -37,12 +37,6 @@ from autograder.authoring.parts import (
 from autograder.authoring.spec import Case, Exercise, Misconception
 from solutions import ch96
 
-
-def _as_column(inputs, name):
-    """One argument, (B, 1): it broadcasts silently to a table of all pairs."""
-    return reshaped(inputs, name, lambda x: x[:, None])
-
-
 # ----------------------------------------------------------------------------------------------------- last_token_scores
 
 
@@ -118,10 +112,7 @@ _WRONG_LAST_TOKEN_SCORES = {
         lambda v, m: (v * m).sum(1),
         "A sum over tokens grows with the length: the score is the last one's value alone.",
     ),
-    "highest-value": (
-        lambda v, m: v.masked_fill(~m, -math.inf).amax(1),
-        "The score is the last kept token's value, not the highest.",
-    ),
+    "highest-value": (lambda v, m: v.where(m, -math.inf).amax(1), "The score is the last kept token's value, not the highest."),
     "column-of-scores": (
         lambda v, m: v.gather(1, _last(m)[:, None]),
         "The shape is (B, 1): one number for each text is asked for, (B,).",
@@ -194,6 +185,9 @@ def _undecided(generator):
     return {"chosen_scores": chosen, "rejected_scores": chosen.clone()}
 
 
+# columns broadcast silently to a table of all pairs
+_REJECTED_COLUMN = reshaped(_plain(), "rejected_scores", lambda x: x[:, None])
+_MARGIN_COLUMN = reshaped(_with_margins(), "margin", lambda x: x[:, None])
 _MARGIN_REACHED = altered(_with_margins(), lambda drawn: {"chosen_scores": drawn["rejected_scores"] + drawn["margin"]})
 
 
@@ -284,8 +278,8 @@ REWARD_MODEL_LOSS = Exercise(
         Case("gradient where scores are 1,000 apart", _far, differentiate=_SCORES),
         Case("single precision", _with_margins(), dtype=torch.float32, visible=True),
         *shape_cases(_with_margins(), _ALL),
-        Case("rejected_scores as a column", _as_column(_plain(), "rejected_scores"), raises=_SCORES),
-        Case("margin as a column", _as_column(_with_margins(), "margin"), raises=_ALL),
+        Case("rejected_scores as a column", _REJECTED_COLUMN, raises=_SCORES),
+        Case("margin as a column", _MARGIN_COLUMN, raises=_ALL),
     ),
     misconceptions=(
         *wrong(_WRONG_REWARD_MODEL_LOSS, _loss),
@@ -325,36 +319,33 @@ def _search(scores):
 
 
 _WRONG_BEST_OF_N = {
-    "lowest-score": (lambda scores: scores.argmin(-1), "This is the worst candidate: take the highest score."),
+    "lowest-score": (lambda s: s.argmin(-1), "This is the worst candidate: take the highest score."),
     "scores-instead-of-indices": (
-        lambda scores: scores.detach().amax(-1),
+        lambda s: s.detach().amax(-1),
         "These are the best scores: which candidates have them is asked, as int64 indices.",
     ),
     "best-prompt": (
-        lambda scores: scores.argmax(0),
+        lambda s: s.argmax(0),
         "For each candidate this finds the best prompt: search along the last axis, over the candidates of each prompt.",
     ),
     "whole-batch": (
-        lambda scores: scores.argmax(),
+        lambda s: s.argmax(),
         "One index for the whole batch: without dim, argmax searches everything. Each prompt needs its own.",
     ),
     "position-in-the-batch": (
-        lambda scores: scores.argmax(-1) + torch.arange(len(scores)) * scores.shape[1],
+        lambda s: s.argmax(-1) + torch.arange(len(s)) * s.shape[1],
         "These count through the whole batch: an index from 0 to n - 1 is asked for each prompt.",
     ),
-    "largest-magnitude": (
-        lambda scores: scores.abs().argmax(-1),
-        "A very bad score is no good score: do not take the absolute value.",
-    ),
+    "largest-magnitude": (lambda s: s.abs().argmax(-1), "A very bad score is no good score: do not take the absolute value."),
     "all-indices-sorted": (
-        lambda scores: scores.argsort(-1, descending=True),
+        lambda s: s.argsort(-1, descending=True),
         "This is the whole ranking, (B, n): only its first column is asked for.",
     ),
     "one-hot": (
-        lambda scores: (scores == scores.amax(-1, keepdim=True)).long(),
+        lambda s: (s == s.amax(-1, keepdim=True)).long(),
         "This marks the best candidate, (B, n): its index is asked for, (B,).",
     ),
-    "int32": (lambda scores: scores.argmax(-1).int(), "Indices are int64, or they index nothing in older code."),
+    "int32": (lambda s: s.argmax(-1).int(), "Indices are int64, or they index nothing in older code."),
 }
 
 BEST_OF_N = Exercise(
@@ -375,11 +366,11 @@ BEST_OF_N = Exercise(
     ),
     misconceptions=wrong(_WRONG_BEST_OF_N),
     variants={
-        "search": lambda scores: _search(scores),
-        "last of the sorted": lambda scores: scores.sort(dim=1).indices[:, -1],
-        "NumPy": lambda scores: torch.from_numpy(scores.detach().numpy().argmax(1)),
-        "topk": lambda scores: scores.topk(1, dim=-1).indices.squeeze(-1),
-        "max": lambda scores: scores.max(dim=1)[1],
+        "search": _search,
+        "last of the sorted": lambda s: s.sort(dim=1).indices[:, -1],
+        "NumPy": lambda s: torch.from_numpy(s.detach().numpy().argmax(1)),
+        "topk": lambda s: s.topk(1, dim=-1).indices.squeeze(-1),
+        "max": lambda s: s.max(dim=1)[1],
     },
 )
 

@@ -367,10 +367,7 @@ _WRONG_DPO_LOSS = {
         _dpo(gap=lambda c, r, ref_c, ref_r: _gap(c, r.detach(), ref_c, ref_r)),
         "The rejected completion is learnt from as well: only the reference is data.",
     ),
-    "dtype-lost": (
-        lambda *given: tuple(value.float() for value in ch97.dpo_loss(*given)),
-        "The results have lost the inputs' dtype.",
-    ),
+    "dtype-lost": (lambda *given: tuple(x.float() for x in ch97.dpo_loss(*given)), "The results have lost the inputs' dtype."),
 }
 
 _AT_HALF = _pairs(beta=0.5)

@@ -54,3 +54,19 @@ def test_what_is_drawn_depends_on_the_settings_and_the_generator_alone():
 
 def test_a_known_number_is_a_scalar_and_several_are_a_vector():
     assert parts.number(0.5)(x=1).shape == () and parts.number(0.5, 0.25)(x=1).tolist() == [0.5, 0.25]
+
+
+def test_altered_inputs_are_made_from_the_others_of_the_same_draw():
+    inputs = parts.altered(
+        parts.drawing(lambda generator: {"x": parts.normal(generator, 3), "n": 2})(), lambda d: {"y": d["n"] * d["x"]}
+    )
+    drawn = inputs(torch.Generator().manual_seed(7))
+    assert list(drawn) == ["x", "n", "y"] and torch.equal(drawn["y"], 2 * drawn["x"])
+
+
+def test_rows_are_cut_to_the_shortest_and_single_ones_repeated():
+    given = (torch.arange(6).reshape(3, 2), torch.arange(5), torch.ones(1, 2), 0.5)
+    x, y, single, scalar = parts.rows_cut(lambda *cut: cut)(*given)
+    assert x.tolist() == [[0, 1], [2, 3], [4, 5]] and y.tolist() == [0, 1, 2]
+    assert single.tolist() == [[1, 1]] * 3 and scalar == 0.5
+    assert parts.rows_cut(lambda one: one)(torch.ones(1)).tolist() == [1]
