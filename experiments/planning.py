@@ -1,0 +1,96 @@
+"""Planning on Pendulum with a learned ensemble: what eight hundred real steps bring, and how far the models on the way can see.
+
+The program of chapter 51's first experiment, for more seeds than a page has time for. The first episode is random; each later one is
+planned with a model of everything before it. Rows are horizons: `error_200`, `mean_200`, … are what `model_error_by_horizon` finds,
+on the last episode, of the models of 200, 400 and 600 steps as they draw and of their expectation, and `still` the error of
+predicting that nothing moves. The summary has the return of each episode.
+"""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import torch
+
+from course_lib.control import mbpo
+from course_lib.control.replay import ReplayBuffer
+from experiments.campaign import Report, Result
+from solutions.ch51 import gaussian_nll, imagine, model_error_by_horizon
+
+ENVIRONMENT = "Pendulum-v1"
+SETTINGS = mbpo.MBPOSettings().but(model_hidden=64)
+OF_THE_MODEL = "members", "elites", "model_hidden", "model_batch", "model_learning_rate", "held_out", "patience"
+PLANNER = {"candidates": 100, "pieces": 5, "hold": 4}
+EPISODES, STEPS, CARRIED_OUT = 4, 200, 2
+HORIZON, APART = 50, 10  # steps of a piece of the last episode, and between the starts of two
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "swing_up": {"environment": ENVIRONMENT, "episodes": EPISODES, "steps": STEPS, "carried_out": CARRIED_OUT}
+    | PLANNER
+    | {name: getattr(SETTINGS, name) for name in OF_THE_MODEL}
+}
+SEEDS = 10
+
+
+def best_plan(model, obs, generator, candidates, pieces, hold):
+    """The best of many sequences of actions, each of which is held for some steps: (pieces * hold, 1)."""
+    plans = (2 * torch.rand(pieces, candidates, 1, generator=generator) - 1).repeat_interleave(hold, 0)
+    upcoming = iter(plans)
+    starts = torch.as_tensor(obs).expand(candidates, -1)
+    dream = imagine(model, lambda obs, generator: next(upcoming), starts, len(plans), generator)
+    return plans[:, dream["rewards"].sum(0).argmax()]
+
+
+def swing_up(seed: int, report: Report, episodes: int = EPISODES, steps: int = STEPS):
+    """Returns of each episode, the model after each but the last, and the last episode: obs (steps + 1, 3), actions (steps, 1)."""
+    env, generator = gym.make(ENVIRONMENT), torch.Generator().manual_seed(seed)
+    model = mbpo.Ensemble(3, 1, SETTINGS, gaussian_nll, seed=seed)
+    buffer, returns, models = ReplayBuffer(steps * episodes, 3, 1), [], []
+    for episode in range(episodes):
+        obs, _ = env.reset(seed=seed if episode == 0 else None)
+        returns.append(0.0)
+        for step in range(steps):
+            if episode and step % CARRIED_OUT == 0:
+                plan = best_plan(model, obs, generator, **PLANNER)
+            action = plan[step % CARRIED_OUT] if episode else 2 * torch.rand(1, generator=generator) - 1
+            next_obs, reward, terminated, _, _ = env.step(2 * action.numpy())
+            buffer.add(obs[None], action[None], [reward], next_obs[None], [terminated])
+            obs, returns[-1] = next_obs, returns[-1] + float(reward)
+        if episode < episodes - 1:
+            model.fit(buffer[torch.arange(len(buffer))], generator)
+            models.append(copy.deepcopy(model))
+        report(episode + 1, episodes)
+    last = buffer[torch.arange(len(buffer) - steps, len(buffer))]
+    return returns, models, torch.cat([last.obs, last.next_obs[-1:]]), last.actions
+
+
+def pieces_of(obs: torch.Tensor, actions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Overlapping pieces of an episode: obs (HORIZON + 1, B, 3) and actions (HORIZON, B, 1)."""
+    starts = torch.arange(0, len(actions) - HORIZON + 1, APART)
+    return obs[starts + torch.arange(HORIZON + 1)[:, None]], actions[starts + torch.arange(HORIZON)[:, None]]
+
+
+def without_dice(model: mbpo.Ensemble):
+    """The model's expectation in place of a draw from it: the mean of its elite members."""
+
+    def expected(obs, actions, generator):
+        mean = model.distributions(obs, actions)[0][model.elites].mean(0)
+        return mean[:, :-1], mean[:, -1], torch.ones(len(obs))
+
+    return expected
+
+
+def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result:
+    """Swing up once, and measure the models; it takes seconds, so that no checkpoint is kept."""
+    returns, models, obs, actions = swing_up(seed, report)
+    real, taken = pieces_of(obs, actions)
+    columns = {"still": (real[1:] - real[0]).square().mean((1, 2)).sqrt()}
+    for i, model in enumerate(models, start=1):
+        for name, asked in (("error", model), ("mean", without_dice(model))):
+            generator = torch.Generator().manual_seed(0)
+            columns[f"{name}_{STEPS * i}"] = model_error_by_horizon(asked, real, taken, generator)
+    rows = [{"horizon": h + 1} | {name: column[h].item() for name, column in columns.items()} for h in range(HORIZON)]
+    return Result(rows, {"returns": returns})

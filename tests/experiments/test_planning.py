@@ -1,0 +1,38 @@
+"""The experiment of chapter 51's planner: it is the page's program, bit for bit, and its rows are horizons."""
+
+import pytest
+import torch
+
+from autograder.authoring import chapter
+from experiments import planning
+from solutions import ch51
+
+TINY = planning.SETTINGS.but(members=2, elites=1, model_hidden=8, patience=1)
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    monkeypatch.setattr(planning, "SETTINGS", TINY)
+
+
+def test_the_page_shows_the_program_that_was_recorded(tiny):
+    (cell,) = [cell for cell in chapter.load("ch51").cells if cell.kind == "code" and "def swing_up" in cell.source]
+    page = dict(vars(ch51))
+    exec(cell.source.partition("swing = ")[0], page)
+    assert (page["SETTINGS"], page["best_plan"].__defaults__) == (planning.mbpo.MBPOSettings().but(model_hidden=64), (100, 5, 4))
+    page["SETTINGS"] = TINY
+    returns, models, obs, actions = page["swing_up"](3, episodes=3)
+    recorded, _, recorded_obs, recorded_actions = planning.swing_up(3, lambda done, total: None, episodes=3)
+    assert returns == recorded and len(models) == 2
+    assert torch.equal(obs, recorded_obs) and torch.equal(actions, recorded_actions)
+
+
+def test_rows_are_horizons_and_the_summary_has_each_return(tiny, tmp_path, monkeypatch):
+    swing_up = planning.swing_up
+    monkeypatch.setattr(planning, "swing_up", lambda seed, report: swing_up(seed, report, episodes=2))
+    told = []
+    result = planning.run("swing_up", 0, tmp_path, lambda done, total: told.append((done, total)))
+    assert [row["horizon"] for row in result.rows] == list(range(1, 51))
+    assert set(result.rows[0]) == {"horizon", "still", "error_200", "mean_200"}
+    assert result.rows[0]["still"] < result.rows[19]["still"]
+    assert len(result.summary["returns"]) == 2 and told == [(1, 2), (2, 2)]
