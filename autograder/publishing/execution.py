@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 import json
 import os
 import re
-import resource
 import sys
 import tempfile
 import time
@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import nbformat
+import psutil
 from jupyter_client.kernelspec import KernelSpec, KernelSpecManager
 from jupyter_client.manager import AsyncKernelManager
 from nbclient import NotebookClient
@@ -42,7 +43,8 @@ RUN_BY = (
     "autograder.publishing.execution:_environment",
 )
 STATES = 3  # of each chapter are kept, so that an undo or a change of branch runs nothing
-CELL_TIMEOUT = 300  # seconds; a page's cells together should need at most 60
+CELL_TIMEOUT = 300  # seconds by the clock, after which a cell hangs
+PAGE_BUDGET = 30  # seconds of processor time that the cells of a page should need together; what needs more is an experiment
 
 
 class BookError(RuntimeError):
@@ -210,7 +212,7 @@ def _execute(chapter: Chapter) -> NotebookNode:
     cells = _code_cells(chapter)
     notebook = new_notebook(cells=[new_code_cell(_source(chapter, cell), metadata={"tags": sorted(cell.tags)}) for cell in cells])
     print(f"{chapter.assignment}: running {len(cells)} code cells", flush=True)
-    started, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    started = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="course-book-") as folder:
         artefacts.hand_in(exercises, Path(folder))
         sockets = str(Path(folder) / "kernel.json")  # a short path, as addresses of local sockets must be
@@ -219,15 +221,33 @@ def _execute(chapter: Chapter) -> NotebookNode:
         client = NotebookClient(notebook, km=kernels, timeout=CELL_TIMEOUT, resources=place, store_widget_state=False)
         try:
             with client.setup_kernel(env=_environment(folder)):
+                kernel = psutil.Process(kernels.provisioner.pid)  # type: ignore[union-attr]  # of this chapter alone: others run beside it
+                spent = [0.0]
                 for index, cell in enumerate(cells):
                     _run_cell(client, index, chapter, cell)
+                    spent.append(_processor_seconds(kernel))
         finally:
             run_sync(kernels.shutdown_kernel)(now=True)  # nbclient leaves a manager that it was given running
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    notebook.metadata["cpu_seconds"] = round(used, 1)
-    print(f"{chapter.assignment}: ran in {time.monotonic() - started:.0f} s, {used:.0f} s of processor time", flush=True)
+    notebook.metadata["cpu_seconds"] = round(spent[-1], 1)
+    each = [after - before for before, after in itertools.pairwise(spent)]
+    print(f"{chapter.assignment}: ran in {time.monotonic() - started:.0f} s, {_cost(chapter, each)}", flush=True)
     return notebook
+
+
+def _processor_seconds(process: psutil.Process) -> float:
+    """What a process and those of its children that have ended have used so far."""
+    times = process.cpu_times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
+def _cost(chapter: Chapter, seconds: Sequence[float]) -> str:
+    """What the cells took together, and if that is above the budget, where the longest of them are."""
+    told = f"{sum(seconds):.0f} s of processor time"
+    if sum(seconds) <= PAGE_BUDGET:
+        return told
+    longest = sorted(zip(seconds, _code_cells(chapter), strict=True), key=lambda pair: -pair[0])[:3]
+    places = "; ".join(f"{took:.0f} s at {os.path.relpath(chapter.path, ROOT)}:{cell.line}" for took, cell in longest)
+    return f"{told}: above a page's budget of {PAGE_BUDGET}, see CONTRIBUTING.md, Long runs. The longest cells: {places}"
 
 
 def _run_cell(client: NotebookClient, index: int, chapter: Chapter, cell: Cell) -> None:

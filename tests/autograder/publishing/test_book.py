@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
+import types
 
 import nbformat
 import pytest
@@ -228,6 +229,22 @@ def test_those_that_took_longest_begin_first(tiny, tmp_path, monkeypatch):
         execution.keep_cached(execution.cache_folder() / f"ch{number}-old.ipynb", nbformat.writes(notebook))
     execution.run_all([dataclasses.replace(tiny.before, number=number) for number in (96, 97, 98, 99)], jobs=1)
     assert ran == [99, 97, 96, 98]  # nobody knows how long a new one takes
+
+
+def test_a_page_above_its_budget_says_where_its_longest_cells_are(tiny):
+    cells = [cell for cell in tiny.chapter.cells if cell.kind == "code"]
+    seconds = [1.0] * (len(cells) - 2) + [execution.PAGE_BUDGET, 2.0]
+    told = execution._cost(tiny.chapter, seconds)
+    assert told.startswith(f"{sum(seconds):.0f} s of processor time: above a page's budget of {execution.PAGE_BUDGET}")
+    where = [int(place) for place in re.findall(r" s at \S+:(\d+)", told)]
+    assert where[:2] == [cells[-2].line, cells[-1].line]
+    within = [0.0] * (len(cells) - 1) + [float(execution.PAGE_BUDGET)]
+    assert execution._cost(tiny.chapter, within) == f"{execution.PAGE_BUDGET} s of processor time"
+
+
+def test_a_page_is_charged_for_its_own_kernel_and_what_that_has_started():
+    times = types.SimpleNamespace(user=1.0, system=2.0, children_user=4.0, children_system=8.0, iowait=16.0)
+    assert execution._processor_seconds(types.SimpleNamespace(cpu_times=lambda: times)) == 15.0
 
 
 def test_table_of_contents_comes_from_the_front_matter(tiny):
