@@ -9,6 +9,7 @@ is one, and the usual one. The one here is much smaller: the tiny language model
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 
 import torch
@@ -52,6 +53,12 @@ class RewardModel(torch.nn.Module):
         return last_token_scores(self(*tokens), tokens.attention_mask)
 
 
+@functools.lru_cache(maxsize=2)
+def _encoded(encode: Callable, texts: tuple[str, ...]) -> Tokens:
+    """Texts as tokens that are only read: whoever fits several models to comparisons of the same texts waits for the tokenizer once."""
+    return encode(texts, ended=True)
+
+
 def fit(
     model: RewardModel,
     comparisons: Preferences,
@@ -68,7 +75,7 @@ def fit(
     Returns: the model, frozen: nothing that uses it may train it by accident.
     """
     generator = torch.Generator().manual_seed(seed)
-    tokens = model.encode(comparisons.texts, ended=True)
+    tokens = _encoded(model.encode, tuple(comparisons.texts))
     lengths = tokens.attention_mask.sum(1)
     optimizer = torch.optim.AdamW(model.parameters(), lr=learning_rate, weight_decay=weight_decay)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, steps)
