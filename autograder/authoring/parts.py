@@ -220,3 +220,14 @@ def rows_cut(formula: Callable) -> Callable:
         return formula(*(x[:rows].expand(rows, *x.shape[1:]) if isinstance(x, torch.Tensor) else x for x in given))
 
     return accepting
+
+
+def spoilt(function: Callable, *ways: Callable[[Callable], Misconception], changed: str = "") -> tuple[Misconception, ...]:
+    """Right, but in each of these ways, such as dtype_lost and cut_from_graph; and once more with the argument `changed` in place."""
+    position = list(inspect.signature(function).parameters).index(changed) if changed else 0
+    return (*(way(function) for way in ways), *([in_place(function, changed, position)] if changed else []))
+
+
+def misshapen(name: str, inputs: Inputs, argument: str, change: Callable, raises: Sequence[str] = (), **options: Any) -> Case:
+    """A case with one argument in another shape, to be refused by an error that names it, or one of those in `raises`."""
+    return Case(name, reshaped(inputs, argument, change), raises=raises or [argument], **options)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,13 +19,14 @@ from autograder.authoring.parts import (
     drawing,
     dtype_lost,
     integers,
+    misshapen,
     normal,
     number,
     one_shape,
     python_float,
     replaced,
-    reshaped,
     satisfies,
+    spoilt,
     uniform,
     versions_of,
     wrong,
@@ -39,40 +43,20 @@ def _integer(generator, high):
     return int(torch.randint(high, (), generator=generator))
 
 
-# ------------------------------------------------------------------------------------------------------ common messages
-
 _SIGN = "This is the log-likelihood, to be made large; a loss is to be made small: negate it."
 _SUM = "A sum grows with the batch, and with it the step: take the mean over the batch."
-_DETACHED = "The loss reaches no parameter: detach only what is data, never the policy's outputs."
-_SAME_SEED = "All episodes begin alike, on the same road: episode k is reset with seed + k."
-_SEEDED_ONCE = "Only the first reset gets a seed: an episode then depends on those before it. Episode k is reset with seed + k."
-_TRUNCATED = "The loop runs on after a truncated episode: an episode ends when it is terminated *or* truncated."
-_TERMINATED = "The loop runs on after a terminated episode: an episode ends when it is terminated *or* truncated."
-_DISCOUNT = "Report the undiscounted return: gamma belongs to learning, not to the measurement."
-_ADDED_UP = "The sum of rewards runs on from episode to episode: set it back to 0 at each reset."
-_LENGTHS = "These are the episodes' lengths: add up the rewards."
-_LAST_REWARD = "The reward of the last step is missing: add it before you leave the loop."
-_BATCH = (
-    "A policy takes a batch of observations, (B, O): call it with policy(obs.unsqueeze(0)), and take the row out of its answer."
-)
-_EPISODES = "num_episodes = 0 asks for nothing: refuse it with a ValueError that names num_episodes."
 
 # ----------------------------------------------------------------------------------------------- collect_demonstrations
 
 
 @drawing
 def _drive(generator, env, policy, **settings):
-    """A case with a policy on a road; `env` and `policy` make what is built from the case's generator."""
-    return {
-        "policy": policy(generator),
-        "env": env,
-        "num_episodes": 2,
-        "seed": _integer(generator, 10_000),
-    } | settings
+    """A policy on a road; `policy` makes what is built from the case's generator."""
+    return {"policy": policy(generator), "env": env, "num_episodes": 2, "seed": _integer(generator, 10_000)} | settings
 
 
-def _driver(**settings):
-    return lambda _generator: built("control.road.RoadDriver", **settings)
+def _driver(_generator):
+    return built("control.road.RoadDriver")
 
 
 def _strong(generator):
@@ -93,9 +77,10 @@ _ROAD = built("control.road.RoadEnv", time_limit=4, gust=0.05, start=0.7)
 _ONE_ARRAY = built("control.road.RoadEnv", time_limit=4, gust=0.05, start=0.7, one_array=True)
 _OPEN_ROAD = built("control.road.RoadEnv", time_limit=None, gust=0.05, start=0.7)
 _DISCRETE_ROAD = built("control.road.RoadEnv", time_limit=4, gust=0.05, discrete=True)
+_NO_EPISODE = Case("num_episodes = 0", _drive(_ROAD, _driver, num_episodes=0), raises=["num_episodes"], visible=True)
 
 
-def _roll(
+def _episodes(
     policy,
     env,
     num_episodes,
@@ -103,91 +88,78 @@ def _roll(
     reset=lambda env, seed, episode: env.reset(seed=seed + episode),
     ended=lambda terminated, truncated: terminated or truncated,
     call=lambda policy, obs: policy(obs.unsqueeze(0)).squeeze(0),
-    row=lambda before, action, after: (before, action),
-    gamma=1.0,
-    carry=False,
-    count_last=True,
-    keep_last=True,
     no_graph=torch.no_grad,
     tensor=lambda obs: torch.tensor(obs, dtype=torch.float32),
 ):
-    """The loop of both exercises, with a place for each mistake: rows (obs, action), episode ids, returns, lengths."""
-    rows, ids, returns, lengths, total = [], [], [], [], 0.0
+    """The loop of both exercises: each episode's steps, (obs, action, reward, next obs). Every setting is the place of a mistake."""
+    episodes = []
     for episode in range(num_episodes):
-        obs, _ = reset(env, seed, episode)
-        total, step, over = (total if carry else 0.0), 0, False
+        (obs, _), steps, over = reset(env, seed, episode), [], False
         while not over:
             before = tensor(obs)
             with no_graph():
                 action = call(policy, before)
             obs, reward, terminated, truncated, _ = env.step(action.detach().numpy())
             over = ended(terminated, truncated)
-            if keep_last or not over:
-                rows.append(row(before, action, tensor(obs)))
-                ids.append(episode)
-            if count_last or not over:
-                total += gamma**step * reward
-            step += 1
-        returns.append(total)
-        lengths.append(float(step))
-    return rows, torch.tensor(ids), torch.tensor(returns), torch.tensor(lengths)
+            steps.append((before, action, reward, tensor(obs)))
+        episodes.append(steps)
+    return episodes
+
+
+def _paid(episodes, returns):
+    """`returns` makes them of the rewards, a list for each episode."""
+    return torch.tensor(returns([[reward for _, _, reward, _ in steps] for steps in episodes]))
+
+
+def _befores(steps):
+    return [before for before, *_ in steps]
+
+
+def _sums(rewards):
+    return [sum(episode) for episode in rewards]
 
 
 _rolled = versions_of(ch74.collect_demonstrations, satisfies(lambda num_episodes: num_episodes >= 1))
 
 
-def _demonstrations(change=lambda demonstrations, lengths: demonstrations, checked=True, **mistake):
-    """A version of the exercise: `mistake` goes to the loop, `change` is made to its result."""
+def _demonstrations(
+    kept=lambda steps: steps,
+    obs=_befores,
+    returns=_sums,
+    change=lambda seen: {},
+    checked=True,
+    **mistake,
+):
+    """A version: `obs` of each episode's `kept` steps, and its return; `change` gives fields of the result anew."""
 
-    def version(policy, env, num_episodes, seed):
-        rows, ids, returns, lengths = _roll(policy, env, num_episodes, seed, **mistake)
-        obs, actions = (torch.stack(column) for column in zip(*rows, strict=True))
-        return change(Demonstrations(obs, actions, ids, returns), lengths)
+    def version(*given):
+        episodes = _episodes(*given, **mistake)
+        written = [kept(steps) for steps in episodes]
+        seen = Demonstrations(
+            torch.stack([row for steps in written for row in obs(steps)]),
+            torch.stack([action for steps in written for _, action, *_ in steps]),
+            torch.tensor([number for number, steps in enumerate(written) for _ in steps]),
+            _paid(episodes, returns),
+        )
+        return replace(seen, **change(seen))
 
     return _rolled(version, checked)
-
-
-def _replaced(**changes):
-    """A change of single fields, each by a function of the demonstrations and the lengths."""
-
-    def change(seen, lengths):
-        fields = {name: getattr(seen, name) for name in ("obs", "actions", "episode_ids", "returns")}
-        return Demonstrations(**fields | {name: new(seen, lengths) for name, new in changes.items()})
-
-    return change
-
-
-def _with_last_obs(policy, env, num_episodes, seed):
-    """One observation too many for each episode: the one that no action answers."""
-    rows, ids, returns, _ = _roll(policy, env, num_episodes, seed, row=lambda *all_three: all_three)
-    obs = []
-    for step, (before, _action, after) in enumerate(rows):
-        obs.append(before)
-        if step + 1 == len(ids) or ids[step + 1] != ids[step]:
-            obs.append(after)
-    return Demonstrations(torch.stack(obs), torch.stack([action for _, action, _ in rows]), ids, returns)
 
 
 def _from_whole_episodes(policy, env, num_episodes, seed):
     episodes = []
     for k in range(num_episodes):
-        obs, actions, rewards = [env.reset(seed=seed + k)[0].copy()], [], []
-        while True:
+        obs, actions, rewards, ends = [env.reset(seed=seed + k)[0].copy()], [], [], [False]
+        while not any(ends):
             with torch.inference_mode():
                 actions.append(policy(torch.from_numpy(obs[-1])[None])[0].clone())
             after, reward, *ends, _ = env.step(actions[-1].numpy())
             rewards.append(reward)
-            if any(ends):
-                break
             obs.append(after.copy())
-        episodes.append((np.stack(obs), torch.stack(actions), np.full(len(obs), k), sum(rewards)))
-    seen, taken, ids, returns = zip(*episodes, strict=True)
-    return Demonstrations(
-        obs=torch.from_numpy(np.concatenate(seen)),
-        actions=torch.cat(taken).clone(),
-        episode_ids=torch.from_numpy(np.concatenate(ids)),
-        returns=torch.tensor(returns, dtype=torch.float32),
-    )
+        episodes.append((np.stack(obs[:-1]), torch.stack(actions), np.full(len(actions), k), sum(rewards)))
+    seen, taken, numbers, returns = zip(*episodes, strict=True)
+    rows, ids = (torch.from_numpy(np.concatenate(column)) for column in (seen, numbers))
+    return Demonstrations(rows, torch.cat(taken).clone(), ids, returns=torch.tensor(returns, dtype=torch.float32))
 
 
 def _in_numpy(policy, env, num_episodes, seed):
@@ -205,70 +177,100 @@ def _in_numpy(policy, env, num_episodes, seed):
 
 def _one_step_at_a_time(policy, env, num_episodes, seed):
     """A single loop over steps, that resets in between."""
-    episode, rewards = 0, [0.0]
-    columns: dict[str, list] = {"obs": [], "actions": [], "episode_ids": []}
-    obs = env.reset(seed=seed)[0]
-    while episode < num_episodes:
+    rows, rewards, obs = [], [0.0], env.reset(seed=seed)[0]
+    while len(rewards) <= num_episodes:
         batch = torch.tensor(np.array([obs]))
-        columns["obs"].append(batch)
-        columns["actions"].append(policy(batch).detach())
-        columns["episode_ids"].append(torch.tensor([episode]))
-        obs, reward, terminated, truncated, _ = env.step(columns["actions"][-1][0].numpy())
+        action = policy(batch).detach()
+        rows.append((batch, action, torch.tensor([len(rewards) - 1])))
+        obs, reward, terminated, truncated, _ = env.step(action[0].numpy())
         rewards[-1] += reward
         if terminated or truncated:
-            episode += 1
+            obs = env.reset(seed=seed + len(rewards))[0]
             rewards.append(0.0)
-            obs = env.reset(seed=seed + episode)[0]
-    return Demonstrations(**{name: torch.cat(column) for name, column in columns.items()}, returns=torch.tensor(rewards[:-1]))
+    obs, actions, ids = (torch.cat(column) for column in zip(*rows, strict=True))
+    return Demonstrations(obs, actions, ids, torch.tensor(rewards[:-1]))
 
 
-_ONLY_LAST = "The rows of the last step are missing: write a step down before you ask whether it was the last."
+# of this exercise and of `evaluate`: settings of the loop, and ways to make returns of rewards
+_WRONG_LOOPS = {
+    "same-seed-each-episode": (
+        {"reset": lambda env, seed, _: env.reset(seed=seed)},
+        "All episodes begin alike, on the same road: episode k is reset with seed + k.",
+    ),
+    "seeded-once": (
+        {"reset": lambda env, seed, episode: env.reset(seed=None if episode else seed)},
+        "Only the first reset gets a seed: an episode then depends on those before it. Episode k is reset with seed + k.",
+    ),
+    "truncation-ignored": (
+        {"ended": lambda terminated, _: terminated},
+        "The loop runs on after a truncated episode: an episode ends when it is terminated *or* truncated.",
+    ),
+    "termination-ignored": (
+        {"ended": lambda _, truncated: truncated},
+        "The loop runs on after a terminated episode: an episode ends when it is terminated *or* truncated.",
+    ),
+    "last-reward-missing": (
+        {"returns": lambda rewards: [sum(episode[:-1], 0.0) for episode in rewards]},
+        "The reward of the last step is missing: add it before you leave the loop.",
+    ),
+    "lengths-for-returns": (
+        {"returns": lambda rewards: [float(len(episode)) for episode in rewards]},
+        "These are the episodes' lengths: add up the rewards.",
+    ),
+    "batch-axis-missing": (
+        {"call": lambda policy, obs: policy(obs)},
+        "A policy takes a batch of observations, (B, O): call it with policy(obs.unsqueeze(0)), and take the row out of its answer.",
+    ),
+}
+_DISCOUNTED = (
+    {"returns": lambda rewards: [sum(0.99**t * reward for t, reward in enumerate(episode)) for episode in rewards]},
+    "Report the undiscounted return: gamma belongs to learning, not to the measurement.",
+)
+_ADDED_UP = (
+    {"returns": lambda rewards: np.cumsum(_sums(rewards)).tolist()},
+    "The sum of rewards runs on from episode to episode: set it back to 0 at each reset.",
+)
+_EPISODES_NEEDED = "num_episodes = 0 asks for nothing: refuse it with a ValueError that names num_episodes."
 
-_GRAPH_KEPT = "The actions carry the expert's graph, the whole network with them: call the policy under torch.no_grad()."
-
-_WRONG_COLLECT_DEMONSTRATIONS = {
+_WRONG_COLLECT_DEMONSTRATIONS = _WRONG_LOOPS | {
+    "returns-discounted": _DISCOUNTED,
+    "returns-added-up": _ADDED_UP,
     "obs-not-copied": (
-        _demonstrations(tensor=torch.from_numpy),
+        {"tensor": torch.from_numpy},
         "The environment fills one array anew at every step, and all rows of an episode are its last observation: copy what you keep;"
         " torch.tensor copies, torch.from_numpy and torch.as_tensor do not.",
     ),
     "obs-after-the-action": (
-        _demonstrations(row=lambda before, action, after: (after, action)),
+        {"obs": lambda steps: [after for *_, after in steps]},
         "Each row pairs an action with the observation that it led to: pair it with the one that the expert had seen.",
     ),
     "last-obs-included": (
-        _rolled(_with_last_obs),
+        {"obs": lambda steps: [steps[0][0], *(after for *_, after in steps)]},
         "There are more observations than actions: to the last one of an episode nobody answered. Leave it out.",
     ),
-    "last-step-missing": (_demonstrations(keep_last=False), _ONLY_LAST),
+    "last-step-missing": (
+        {"kept": lambda steps: steps[:-1]},
+        "The rows of the last step are missing: write a step down before you ask whether it was the last.",
+    ),
     "actions-clipped": (
-        _demonstrations(_replaced(actions=lambda seen, _: seen.actions.clamp(-1, 1) if seen.actions.ndim > 1 else seen.actions)),
+        {"change": lambda seen: {"actions": seen.actions.clamp(-1, 1) if seen.actions.ndim > 1 else seen.actions}},
         "Write the actions down as the policy returned them; what the environment makes of them is its own affair.",
     ),
-    "same-seed-each-episode": (_demonstrations(reset=lambda env, seed, _: env.reset(seed=seed)), _SAME_SEED),
-    "seeded-once": (_demonstrations(reset=lambda env, seed, episode: env.reset(seed=None if episode else seed)), _SEEDED_ONCE),
-    "truncation-ignored": (_demonstrations(ended=lambda terminated, _: terminated), _TRUNCATED),
-    "termination-ignored": (_demonstrations(ended=lambda _, truncated: truncated), _TERMINATED),
-    "ids-from-one": (
-        _demonstrations(_replaced(episode_ids=lambda seen, _: seen.episode_ids + 1)),
-        "Episodes are numbered from 0.",
-    ),
+    "ids-from-one": ({"change": lambda seen: {"episode_ids": seen.episode_ids + 1}}, "Episodes are numbered from 0."),
     "steps-numbered": (
-        _demonstrations(_replaced(episode_ids=lambda seen, _: torch.arange(len(seen.obs)))),
+        {"change": lambda seen: {"episode_ids": torch.arange(len(seen.obs))}},
         "episode_ids numbers the steps: all steps of one episode share one number.",
     ),
-    "returns-discounted": (_demonstrations(gamma=0.99), _DISCOUNT),
-    "returns-added-up": (_demonstrations(carry=True), _ADDED_UP),
-    "last-reward-missing": (_demonstrations(count_last=False), _LAST_REWARD),
-    "lengths-for-returns": (_demonstrations(_replaced(returns=lambda _, lengths: lengths)), _LENGTHS),
-    "batch-axis-missing": (_demonstrations(call=lambda policy, obs: policy(obs)), _BATCH),
     "batch-axis-kept": (
-        _demonstrations(_replaced(obs=lambda seen, _: seen.obs.unsqueeze(1), actions=lambda seen, _: seen.actions.unsqueeze(1))),
+        {"change": lambda seen: {"obs": seen.obs.unsqueeze(1), "actions": seen.actions.unsqueeze(1)}},
         "Each row still has the axis of its batch of one: take the row out with [0] or squeeze(0), or join rows with torch.cat.",
     ),
-    "graph-kept": (_demonstrations(no_graph=torch.enable_grad), _GRAPH_KEPT),
+    "graph-kept": (
+        {"no_graph": torch.enable_grad},
+        "The actions carry the expert's graph, the whole network with them: call the policy under torch.no_grad().",
+    ),
     "dtype-lost": (
-        _demonstrations(_replaced(obs=lambda seen, _: seen.obs.double(), returns=lambda seen, _: seen.returns.double())),
+        {"change": lambda seen: {"obs": seen.obs.double(), "returns": seen.returns.double()}},
         "Observations and returns are to be float32, as networks take them; NumPy's own numbers are float64.",
     ),
 }
@@ -278,18 +280,18 @@ COLLECT_DEMONSTRATIONS = Exercise(
     reference=ch74.collect_demonstrations,
     criteria={"values": 1.2, "gradient": 0.1, "dtype": 0.1, "errors": 0.1},
     cases=(
-        Case("episodes that are cut off", _drive(_ROAD, _driver()), visible=True),
+        Case("episodes that are cut off", _drive(_ROAD, _driver), visible=True),
         Case("episodes that end off the road", _drive(_OPEN_ROAD, _weak), visible=True),
         Case("commands beyond ±1", _drive(_ROAD, _strong), visible=True),
         Case("discrete commands", _drive(_DISCRETE_ROAD, _three_commands)),
-        Case("a single episode", _drive(_ROAD, _driver(), num_episodes=1)),
-        Case("one step an episode", _drive(built("control.road.RoadEnv", time_limit=1), _driver(), num_episodes=4)),
-        Case("a road that fills one array anew", _drive(_ONE_ARRAY, _driver()), visible=True),
-        Case("num_episodes = 0", _drive(_ROAD, _driver(), num_episodes=0), raises=["num_episodes"], visible=True),
+        Case("a single episode", _drive(_ROAD, _driver, num_episodes=1)),
+        Case("one step an episode", _drive(built("control.road.RoadEnv", time_limit=1), _driver, num_episodes=4)),
+        Case("a road that fills one array anew", _drive(_ONE_ARRAY, _driver), visible=True),
+        _NO_EPISODE,
     ),
     misconceptions=(
-        *wrong(_WRONG_COLLECT_DEMONSTRATIONS),
-        bad_input_accepted(_demonstrations(checked=False), _EPISODES),
+        *wrong(_WRONG_COLLECT_DEMONSTRATIONS, lambda mistake: _demonstrations(**mistake)),
+        bad_input_accepted(_demonstrations(checked=False), _EPISODES_NEEDED),
     ),
     variants={
         "whole episodes joined": _rolled(_from_whole_episodes),
@@ -311,24 +313,16 @@ def _steps(lengths, ids=None):
 @drawing
 def _split(generator, episode_ids, fraction):
     """`episode_ids` is made from the case's generator."""
-    return {
-        "episode_ids": episode_ids(generator),
-        "fraction": fraction,
-        "generator": built("seeding.generator", seed=_integer(generator, 10_000)),
-    }
+    ids = episode_ids(generator)
+    return {"episode_ids": ids, "fraction": fraction, "generator": built("seeding.generator", seed=_integer(generator, 10_000))}
+
+
+def _split_case(name, episode_ids, fraction, **options):
+    return Case(name, _split(episode_ids, fraction), **{"view": "episode_split"} | options)
 
 
 def _even(count, length=7):
     return lambda _generator: _steps([length] * count)
-
-
-def _in_turns(_generator):
-    """One step of each episode, again and again, as from parallel environments."""
-    return torch.arange(12).repeat(5)
-
-
-def _uneven(generator):
-    return _steps(integers(generator, 2, 30, 40))
 
 
 def _one_giant(generator):
@@ -340,8 +334,7 @@ def _one_giant(generator):
 
 def _odd_numbers(generator):
     """Numbers with gaps, and the steps of all episodes mixed."""
-    ids = _steps([1] * 400, 5 + 13 * torch.arange(400))
-    return ids[torch.randperm(len(ids), generator=generator)]
+    return (5 + 13 * torch.arange(400))[torch.randperm(400, generator=generator)]
 
 
 _splits = versions_of(
@@ -359,139 +352,102 @@ def _shuffled(number, generator):
     return torch.randperm(number, generator=generator)
 
 
-def _held(ids, fraction, generator, count=_count, order=_shuffled):
-    episodes = ids.unique()
-    chosen = episodes[order(len(episodes), generator)[: count(len(episodes), fraction)]]
-    return torch.isin(ids, chosen)
+def _held(ids, fraction, generator, *, episodes=None, count=_count, order=_shuffled):
+    """The mask of the steps that are held out; every setting is the place of a mistake."""
+    episodes = ids.unique() if episodes is None else episodes
+    return torch.isin(ids, episodes[order(len(episodes), generator)[: count(len(episodes), fraction)]])
 
 
-def _sides(held_out):
-    return ~held_out, held_out
-
-
-def _drawn(**parts):
-    """Whole episodes on either side, with another `count` or `order`."""
-    return lambda ids, fraction, generator: _sides(_held(ids, fraction, generator, **parts))
-
-
-def _by_steps(ids, fraction, generator):
-    order = torch.randperm(len(ids), generator=generator)
-    held_out = torch.zeros(len(ids), dtype=torch.bool)
-    held_out[order[: _count(len(ids), fraction)]] = True
-    return _sides(held_out)
-
-
-def _by_cut(ids, fraction, _generator):
-    """The last steps, in their order: the cut goes through the middle of an episode."""
-    position = torch.arange(len(ids))
-    return _sides(position >= len(ids) - _count(len(ids), fraction))
-
-
-def _by_coin(ids, fraction, generator):
-    """A coin for each episode."""
-    episodes = ids.unique()
-    return _sides(torch.isin(ids, episodes[torch.rand(len(episodes), generator=generator) < fraction]))
+def _halves(held=_held, sides=lambda held: (~held, held), checked=True):
+    """A version: what is `held` out, and the `sides` made of it."""
+    return _splits(lambda *given: sides(held(*given)), checked)
 
 
 def _until_steps(ids, fraction, generator):
     """Episodes are held out until they have the share of the steps."""
-    episodes = ids.unique()
-    held_out = torch.zeros(len(ids), dtype=torch.bool)
-    for episode in episodes[torch.randperm(len(episodes), generator=generator)][:-1]:
-        held_out |= ids == episode
-        if held_out.sum() >= fraction * len(ids):
-            break
-    return _sides(held_out)
-
-
-def _numbers_assumed(ids, fraction, generator):
-    """Believes that the ids are 0, 1, …, E - 1."""
-    number = int(ids.max()) + 1
-    chosen = torch.randperm(number, generator=generator)[: _count(number, fraction)]
-    return _sides(torch.isin(ids, chosen))
-
-
-def _indices(ids, fraction, generator):
-    held_out = _held(ids, fraction, generator)
-    return (~held_out).nonzero().squeeze(1), held_out.nonzero().squeeze(1)
+    episodes, sizes = ids.unique(return_counts=True)
+    order = _shuffled(len(episodes), generator)
+    still_short = sizes[order].cumsum(0) < fraction * len(ids)
+    return torch.isin(ids, episodes[order[:-1][: 1 + still_short.sum()]])
 
 
 def _with_a_set(ids, fraction, generator):
     numbers = sorted(set(ids.tolist()))
     keys = torch.rand(len(numbers), generator=generator, dtype=torch.float64).tolist()
-    order = [number for _, number in sorted(zip(keys, numbers, strict=True))]
     count = max(1, min(len(numbers) - 1, math.ceil(fraction * len(numbers))))
-    chosen = set(order[:count])
-    held_out = torch.tensor([number in chosen for number in ids.tolist()])
-    return torch.logical_not(held_out), held_out
+    chosen = {number for _, number in sorted(zip(keys, numbers, strict=True))[:count]}
+    return torch.tensor([number in chosen for number in ids.tolist()])
 
 
 def _with_inverse(ids, fraction, generator):
     episodes, inverse = torch.unique(ids, return_inverse=True)
     count = int(fraction * len(episodes))
     count = 1 if count < 1 else count - (count == len(episodes))
-    rank = torch.randperm(len(episodes), generator=generator)
-    train = rank[inverse] >= count
-    return train, rank[inverse] < count
+    return torch.randperm(len(episodes), generator=generator)[inverse] < count
 
 
 def _with_training_episodes(ids, fraction, generator):
     episodes = ids.unique().numpy()
     picks = np.random.default_rng(int(torch.randint(2**31, (), generator=generator)))
     kept = len(episodes) - _count(len(episodes), fraction)
-    train = np.isin(ids.numpy(), picks.choice(episodes, size=kept, replace=False))
-    return torch.from_numpy(train), torch.from_numpy(~train)
+    return torch.from_numpy(~np.isin(ids.numpy(), picks.choice(episodes, size=kept, replace=False)))
 
 
-_WRONG_SPLIT_BY_EPISODE = {
+_WRONGLY_HELD = {
     "split-by-steps": (
-        _by_steps,
+        lambda ids, *rest: _held(torch.arange(len(ids)), *rest),
         "Steps are drawn, not episodes: nearly every episode is on both sides, and neighbours in time are near-copies. Draw episodes.",
     ),
     "cut-through-an-episode": (
-        _by_cut,
+        lambda ids, fraction, _: torch.arange(len(ids)) >= len(ids) - _count(len(ids), fraction),
         "The steps are cut at a position, in their order, and an episode may lie on both sides of the cut. Draw whole episodes.",
     ),
-    "sides-swapped": (
-        lambda *given: _sides(_held(*given))[::-1],
-        "The masks come in the order train, held_out, and fraction is the share of the held-out side.",
-    ),
-    "held-out-in-training": (
-        lambda ids, *rest: (torch.ones(len(ids), dtype=torch.bool), _held(ids, *rest)),
-        "The held-out steps are trained on as well: the two masks must exclude each other.",
-    ),
     "a-coin-for-each-episode": (
-        _by_coin,
+        lambda ids, fraction, generator: (torch.rand(int(ids.max()) + 1, generator=generator) < fraction)[ids],
         "The number of held-out episodes is left to chance, and may be 0: shuffle the episodes and take a fixed number.",
     ),
     "counted-in-steps": (_until_steps, "fraction is a share of the episodes, not of the steps: long and short ones count alike."),
     "rounded-to-none": (
-        _drawn(count=lambda number, fraction: int(fraction * number)),
+        lambda *given: _held(*given, count=lambda number, fraction: int(fraction * number)),
         "With few episodes the count rounds down to 0, and nothing is held out: at least one episode stays on either side.",
     ),
     "rounded-to-all": (
-        _drawn(count=lambda number, fraction: max(math.ceil(fraction * number), 1)),
+        lambda *given: _held(*given, count=lambda number, fraction: max(math.ceil(fraction * number), 1)),
         "With few episodes the count rounds up to all, and nothing is left to train on: at least one episode stays on either side.",
     ),
     "numbers-assumed": (
-        _numbers_assumed,
+        lambda ids, *rest: _held(ids, *rest, episodes=torch.arange(int(ids.max()) + 1)),
         "The episodes are not always numbered 0, 1, 2, …: find out which numbers occur, with episode_ids.unique().",
     ),
     "not-shuffled": (
-        _drawn(order=lambda number, _generator: torch.arange(number)),
+        lambda *given: _held(*given, order=lambda number, _generator: torch.arange(number)),
         "It is always the same episodes that are held out, the first ones: draw their order from the generator.",
     ),
     "global-generator": (
-        _drawn(order=lambda number, _generator: torch.randperm(number)),
+        lambda *given: _held(*given, order=lambda number, _generator: torch.randperm(number)),
         "The order comes from the global generator: pass generator=generator, so that a seed makes the split again.",
     ),
     "reseeded-inside": (
-        lambda ids, fraction, generator: _sides(_held(ids, fraction, generator.manual_seed(0))),
+        lambda ids, fraction, generator: _held(ids, fraction, generator.manual_seed(0)),
         "The generator is set back at every call, so every split is the same one: use it as it comes.",
     ),
-    "indices-returned": (_indices, "Bool masks over the steps are asked for, not indices."),
+}
+
+_WRONG_SIDES = {
+    "sides-swapped": (
+        lambda held: (held, ~held),
+        "The masks come in the order train, held_out, and fraction is the share of the held-out side.",
+    ),
+    "held-out-in-training": (
+        lambda held: (torch.ones_like(held), held),
+        "The held-out steps are trained on as well: the two masks must exclude each other.",
+    ),
+    "indices-returned": (
+        lambda held: ((~held).nonzero().squeeze(1), held.nonzero().squeeze(1)),
+        "Bool masks over the steps are asked for, not indices.",
+    ),
     "masks-as-numbers": (
-        lambda *given: tuple(mask.long() for mask in _sides(_held(*given))),
+        lambda held: ((~held).long(), held.long()),
         "Masks are bool: as numbers, 0 and 1 would be taken for indices.",
     ),
 }
@@ -501,34 +457,40 @@ SPLIT_BY_EPISODE = Exercise(
     reference=ch74.split_by_episode,
     criteria={"values": 1.3, "inputs": 0.1, "errors": 0.1},
     cases=(
-        Case("ten even episodes, a fifth held out", _split(_even(10), 0.2), view="episode_split", visible=True),
-        Case("forty uneven episodes, a quarter held out", _split(_uneven, 0.25), view="episode_split", visible=True),
-        Case("thirty episodes, one of them a giant", _split(_one_giant, 0.1), view="episode_split", draws=2),
-        Case("two hundred short episodes, half held out", _split(_even(200, 3), 0.5), view="episode_split", draws=2),
-        Case("numbers with gaps, steps in any order", _split(_odd_numbers, 0.3), view="episode_split", visible=True, draws=3),
-        Case("episodes in turns", _split(_in_turns, 0.3), view="episode_split"),
-        Case("three episodes, a tenth held out", _split(_even(3), 0.1), view="episode_split", visible=True),
-        Case("five episodes, fraction = 0", _split(_even(5), 0.0), view="episode_split"),
-        Case("five episodes, fraction = 1", _split(_even(5), 1.0), view="episode_split"),
-        Case("three episodes, nearly all held out", _split(_even(3), 0.95), view="episode_split"),
-        Case("two splits in a row", _split(_even(60, 2), 0.5), repeat=2, view="two_splits", visible=True),
-        Case("the generator is drawn from", _split(_even(20), 0.3), returns=("generator",), view="drawn_from", visible=True),
+        _split_case("ten even episodes, a fifth held out", _even(10), 0.2, visible=True),
+        _split_case(
+            "forty uneven episodes, a quarter held out",
+            lambda generator: _steps(integers(generator, 2, 30, 40)),
+            0.25,
+            visible=True,
+        ),
+        _split_case("thirty episodes, one of them a giant", _one_giant, 0.1),
+        _split_case("two hundred short episodes, half held out", _even(200, 3), 0.5),
+        _split_case("numbers with gaps, steps in any order", _odd_numbers, 0.3, visible=True, draws=3),
+        _split_case("episodes in turns", lambda _: torch.arange(12).repeat(5), 0.3),
+        _split_case("three episodes, a tenth held out", _even(3), 0.1, visible=True),
+        _split_case("five episodes, fraction = 0", _even(5), 0.0),
+        _split_case("five episodes, fraction = 1", _even(5), 1.0),
+        _split_case("three episodes, nearly all held out", _even(3), 0.95),
+        _split_case("two splits in a row", _even(60, 2), 0.5, repeat=2, view="two_splits", visible=True),
+        _split_case("the generator is drawn from", _even(20), 0.3, returns=("generator",), view="drawn_from", visible=True),
         Case("fraction = -0.1", _split(_even(5), -0.1), raises=["fraction"]),
         Case("fraction = 20", _split(_even(5), 20.0), raises=["fraction"], visible=True),
         Case("a single episode", _split(_even(1), 0.5), raises=["episode_ids"]),
     ),
     misconceptions=(
-        *wrong(_WRONG_SPLIT_BY_EPISODE, _splits),
+        *wrong(_WRONGLY_HELD, _halves),
+        *wrong(_WRONG_SIDES, lambda sides: _halves(sides=sides)),
         bad_input_accepted(
-            _splits(_drawn(), checked=False),
+            _halves(checked=False),
             "A fraction outside [0, 1] is a percentage or a slip, and one episode cannot be split: refuse both.",
         ),
     ),
     variants={
-        "a set of numbers, rounded up": _splits(_with_a_set),
-        "ranks of the episodes, rounded down": _splits(_with_inverse),
-        "training episodes drawn, by NumPy seeded from the generator": _splits(_with_training_episodes),
-        "the reference's way, by parts": _splits(_drawn()),
+        "a set of numbers, rounded up": _halves(_with_a_set),
+        "ranks of the episodes, rounded down": _halves(_with_inverse),
+        "training episodes drawn, by NumPy seeded from the generator": _halves(_with_training_episodes),
+        "the reference's way, by parts": _halves(),
     },
 )
 
@@ -537,10 +499,7 @@ SPLIT_BY_EPISODE = Exercise(
 
 @drawing
 def _choices(generator, size=24, actions=4, spread=1.5):
-    return {
-        "logits": spread * normal(generator, size, actions),
-        "expert_actions": integers(generator, 0, actions, size),
-    }
+    return {"logits": spread * normal(generator, size, actions), "expert_actions": integers(generator, 0, actions, size)}
 
 
 def _right_by_far(generator):
@@ -561,21 +520,12 @@ def _of_expert(x, actions):
     return x.gather(1, actions.reshape(-1, 1)).squeeze(1)
 
 
-def _unchecked_discrete(logits, actions):
-    """Cross-entropy written with gather, which lets a column of actions pass."""
-    return -_of_expert(logits.log_softmax(-1), actions)[: len(logits)].mean()
-
-
 def _by_hand(logits, expert_actions):
     rows = [[number - max(row) for number in row] for row in logits.tolist()]
     taken = zip(rows, expert_actions.tolist(), strict=True)
     surprises = [math.log(sum(map(math.exp, row))) - row[action] for row, action in taken]
     return torch.tensor(sum(surprises) / len(surprises), dtype=torch.float64)
 
-
-_LOGITS_SHAPES = (
-    "logits must be (B, A) with one expert action for each row, (B,): a column of actions fails late or, worse, not at all."
-)
 
 _WRONG_BEHAVIOURAL_CLONING_LOSS = {
     "softmax-twice": (
@@ -620,7 +570,10 @@ _WRONG_BEHAVIOURAL_CLONING_LOSS = {
         lambda x, a: F.cross_entropy(x, a) / math.log(2),
         "The logarithm is natural in this course: nats, not bits.",
     ),
-    "logits-detached": (lambda x, a: F.cross_entropy(x.detach(), a), _DETACHED),
+    "logits-detached": (
+        lambda x, a: F.cross_entropy(x.detach(), a),
+        "The loss reaches no parameter: detach only what is data, never the policy's outputs.",
+    ),
 }
 
 BEHAVIOURAL_CLONING_LOSS = Exercise(
@@ -635,19 +588,16 @@ BEHAVIOURAL_CLONING_LOSS = Exercise(
         Case("logits that require gradient", _choices(7, 3), differentiate=["logits"], visible=True),
         Case("gradient of logits around 900", _right_by_far, differentiate=["logits"]),
         Case("single precision", _choices(), dtype=torch.float32, visible=True),
-        Case(
-            "expert_actions as a column",
-            reshaped(_choices(), "expert_actions", lambda a: a[:, None]),
-            raises=_DISCRETE,
-            visible=True,
-        ),
-        Case("an expert action too few", reshaped(_choices(), "expert_actions", lambda a: a[:-1]), raises=_DISCRETE),
+        misshapen("expert_actions as a column", _choices(), "expert_actions", lambda x: x[:, None], _DISCRETE, visible=True),
+        misshapen("an expert action too few", _choices(), "expert_actions", lambda x: x[:-1], _DISCRETE),
     ),
     misconceptions=(
         *wrong(_WRONG_BEHAVIOURAL_CLONING_LOSS, _discrete),
-        python_float(ch74.behavioural_cloning_loss),
-        dtype_lost(ch74.behavioural_cloning_loss),
-        bad_input_accepted(_discrete(_unchecked_discrete, checked=False), _LOGITS_SHAPES),
+        *spoilt(ch74.behavioural_cloning_loss, python_float, dtype_lost),
+        bad_input_accepted(
+            _discrete(lambda x, a: -_of_expert(x.log_softmax(-1), a)[: len(x)].mean(), checked=False),
+            "logits must be (B, A) with one expert action for each row, (B,): a column of actions fails late or, worse, not at all.",
+        ),
     ),
     variants={
         "log_softmax and gather": _discrete(lambda x, a: -_of_expert(x.log_softmax(-1), a).mean()),
@@ -671,13 +621,9 @@ _GAUSSIAN = ("mean", "log_std", "expert_actions")
 @drawing
 def _continuous(generator, size=11, actions=3, per_state=False, log_std=-0.5, spread=0.8):
     mean = normal(generator, size, actions)
-    shape = (size, actions) if per_state else (actions,)
-    log_stds = log_std + 0.4 * normal(generator, *shape)
-    return {
-        "mean": mean,
-        "log_std": log_stds,
-        "expert_actions": mean + spread * log_stds.exp() * normal(generator, size, actions),
-    }
+    log_stds = log_std + 0.4 * normal(generator, *((size, actions) if per_state else (actions,)))
+    taken = mean + spread * log_stds.exp() * normal(generator, size, actions)
+    return {"mean": mean, "log_std": log_stds, "expert_actions": taken}
 
 
 def _perfect(generator):
@@ -688,6 +634,10 @@ def _perfect(generator):
 
 def _surprise(mean, log_std, actions):
     return ((actions - mean) / log_std.exp()).square() / 2 + log_std + _HALF_LOG_TWO_PI
+
+
+def _mean_surprise(mean, log_std, actions):
+    return _surprise(mean, log_std, actions).sum(-1).mean()
 
 
 _gaussian = versions_of(
@@ -708,15 +658,13 @@ def _gaussian_by_hand(mean, log_std, expert_actions):
     return torch.tensor(total / len(mean), dtype=torch.float64)
 
 
-_GAUSSIAN_SHAPES = "Shapes that differ broadcast silently, (B, 1) against (B, A) or a row against all rows: compare them first."
-
 _WRONG_GAUSSIAN_CLONING_LOSS = {
     "log-std-taken-as-std": (
         lambda m, s, a: ((a - m) / s).square().div(2).add(s.abs().log()).add(_HALF_LOG_TWO_PI).sum(-1).mean(),
         "log_std is the logarithm of σ: σ = log_std.exp().",
     ),
     "log-std-taken-as-log-variance": (
-        lambda m, s, a: _surprise(m, s / 2, a).sum(-1).mean(),
+        lambda m, s, a: _mean_surprise(m, s / 2, a),
         "log_std is log σ, not log σ²: the square is σ² = exp(2 log_std), and log σ enters without a half.",
     ),
     "divided-by-std-once": (
@@ -745,19 +693,16 @@ _WRONG_GAUSSIAN_CLONING_LOSS = {
     ),
     "sum-over-batch": (lambda m, s, a: _surprise(m, s, a).sum(), _SUM),
     "per-step-losses": (lambda m, s, a: _surprise(m, s, a).sum(-1), "One number is asked for: take the mean over B."),
-    "sign-missing": (lambda m, s, a: -_surprise(m, s, a).sum(-1).mean(), _SIGN),
+    "sign-missing": (lambda m, s, a: -_mean_surprise(m, s, a), _SIGN),
     "squared-error": (
         lambda m, s, a: (a - m).square().sum(-1).mean(),
         "This is the squared error: right up to a factor while σ is fixed, but log_std has no part in it.",
     ),
     "log-std-detached": (
-        lambda m, s, a: _surprise(m, s.detach(), a).sum(-1).mean(),
+        lambda m, s, a: _mean_surprise(m, s.detach(), a),
         "No gradient reaches log_std, so σ is never learned: only the expert's actions are data.",
     ),
-    "mean-detached": (
-        lambda m, s, a: _surprise(m.detach(), s, a).sum(-1).mean(),
-        "No gradient reaches the mean, which is to learn.",
-    ),
+    "mean-detached": (lambda m, s, a: _mean_surprise(m.detach(), s, a), "No gradient reaches the mean, which is to learn."),
 }
 
 GAUSSIAN_CLONING_LOSS = Exercise(
@@ -775,25 +720,22 @@ GAUSSIAN_CLONING_LOSS = Exercise(
         Case("all inputs require gradient", _continuous(), differentiate=_GAUSSIAN, visible=True),
         Case("gradient to a σ for every state", _continuous(per_state=True), differentiate=_GAUSSIAN),
         Case("single precision", _continuous(), dtype=torch.float32, visible=True),
-        Case(
-            "expert_actions with an action too few",
-            reshaped(_continuous(), "expert_actions", lambda a: a[:, :1]),
-            raises=_PAIR,
-            visible=True,
+        misshapen(
+            "expert_actions with an action too few", _continuous(), "expert_actions", lambda x: x[:, :1], _PAIR, visible=True
         ),
-        Case("expert_actions of a single row", reshaped(_continuous(), "expert_actions", lambda a: a[0]), raises=_PAIR),
-        Case("log_std as a column", reshaped(_continuous(per_state=True), "log_std", lambda s: s[:, :1]), raises=["log_std"]),
+        misshapen("expert_actions of a single row", _continuous(), "expert_actions", lambda x: x[0], _PAIR),
+        misshapen("log_std as a column", _continuous(per_state=True), "log_std", lambda x: x[:, :1]),
     ),
     misconceptions=(
         *wrong(_WRONG_GAUSSIAN_CLONING_LOSS, _gaussian),
         Misconception(
-            "gradient-into-expert-actions",
-            _gaussian(lambda m, s, a: _surprise(m, s, a).sum(-1).mean(), leak=True),
-            "The expert's actions are data: detach them.",
+            "gradient-into-expert-actions", _gaussian(_mean_surprise, leak=True), "The expert's actions are data: detach them."
         ),
-        python_float(ch74.gaussian_cloning_loss),
-        dtype_lost(ch74.gaussian_cloning_loss),
-        bad_input_accepted(_gaussian(lambda m, s, a: _surprise(m, s, a).sum(-1).mean(), checked=False), _GAUSSIAN_SHAPES),
+        *spoilt(ch74.gaussian_cloning_loss, python_float, dtype_lost),
+        bad_input_accepted(
+            _gaussian(_mean_surprise, checked=False),
+            "Shapes that differ broadcast silently, (B, 1) against (B, A) or a row against all rows: compare them first.",
+        ),
     ),
     variants={
         "a normal distribution": _gaussian(lambda m, s, a: -Normal(m, s.exp()).log_prob(a).sum(-1).mean()),
@@ -844,43 +786,41 @@ def _lines(generator):
 # batches that one pass over the data fills, with a loss that is their size
 _COUNTED = replaced(_regression(batch_size=8, num_steps=3), loss_fn=built("control.demonstrations.RowCount"))
 
-
-def _descend(network, learning_rate):
-    for weights in network.parameters():
-        weights.data.sub_(weights.grad, alpha=learning_rate)
-        weights.grad = None
-
-
 _training = versions_of(
     ch74.train_bc, satisfies(lambda num_steps: num_steps >= 1), satisfies(lambda obs, actions: len(obs) == len(actions))
 )
 
 
 def _trained(
-    move=_descend,
-    loss=lambda loss_fn, outputs, actions: loss_fn(outputs, actions),
     rows=lambda count, batch_size, generator: torch.randperm(count, generator=generator)[:batch_size],
     pair=lambda rows: rows,
+    loss=lambda loss_fn, outputs, actions: loss_fn(outputs, actions),
+    kept=torch.Tensor.detach,
     result=torch.stack,
+    network=lambda network: network,
     steps=lambda num_steps: num_steps,
     rate=lambda learning_rate: learning_rate,
-    trained=lambda network: network,
+    one_minibatch=False,
+    stepping=True,
+    clearing=True,
     checked=True,
-    once=False,
-    kept=torch.Tensor.detach,
 ):
-    """A version of the training with plain gradient descent: every argument is the place of a mistake."""
+    """A version of the training with plain gradient descent: every setting is the place of a mistake."""
 
-    def version(network, loss_fn, obs, actions, num_steps, batch_size, learning_rate, generator):
-        network, losses = trained(network), []
-        chosen = rows(len(obs), batch_size, generator)
-        for step in range(steps(num_steps)):
-            if step and not once:
+    def version(given, loss_fn, obs, actions, num_steps, batch_size, learning_rate, generator):
+        learner = network(given)
+        losses: list[torch.Tensor] = []
+        for _ in range(steps(num_steps)):
+            if not (losses and one_minibatch):
                 chosen = rows(len(obs), batch_size, generator)
-            current = loss(loss_fn, network(obs[chosen]), actions[pair(chosen)])
+            current = loss(loss_fn, learner(obs[chosen]), actions[pair(chosen)])
             current.backward()
             losses.append(kept(current))
-            move(network, rate(learning_rate))
+            for weights in learner.parameters():
+                if stepping:
+                    weights.data.sub_(weights.grad, alpha=rate(learning_rate))
+                if clearing:
+                    weights.grad = None
         return result(losses)
 
     return _training(version, checked)
@@ -890,8 +830,7 @@ def _optimised(make):
     """A correct version with another optimiser and another way to draw a minibatch."""
 
     def version(network, loss_fn, obs, actions, num_steps, batch_size, learning_rate, generator):
-        optimizer = make(network.parameters(), lr=learning_rate)
-        losses = torch.zeros(num_steps)
+        optimizer, losses = make(network.parameters(), lr=learning_rate), torch.zeros(num_steps)
         for step in range(num_steps):
             whole = batch_size >= len(obs)
             chosen = torch.arange(len(obs)) if whole else integers(generator, 0, len(obs), batch_size)
@@ -918,20 +857,6 @@ def _in_epochs(network, loss_fn, obs, actions, num_steps, batch_size, learning_r
     return torch.stack([loss.detach() for loss in losses[:num_steps]])
 
 
-def _accumulating(network, learning_rate):
-    for weights in network.parameters():
-        weights.data.sub_(weights.grad, alpha=learning_rate)
-
-
-def _standing_still(network, _learning_rate):
-    for weights in network.parameters():
-        weights.grad = None
-
-
-def _copied(network):
-    return type(network)(network.weights.detach().clone(), network.bias.detach().clone(), network.discrete)
-
-
 def _least_squares(network, loss_fn, obs, actions, **_settings):
     design = torch.cat([obs, torch.ones(len(obs), 1, dtype=obs.dtype)], 1)
     solution = torch.linalg.lstsq(design, actions).solution
@@ -939,14 +864,12 @@ def _least_squares(network, loss_fn, obs, actions, **_settings):
     network.bias.data.copy_(solution[2])
 
 
-_NETWORK = ("network",)  # what is looked at after the call
-
 _WRONG_TRAIN_BC = {
     "gradients-not-cleared": (
-        _trained(_accumulating),
+        _trained(clearing=False),
         "Gradients add up from step to step: call optimizer.zero_grad() before each backward().",
     ),
-    "no-step": (_trained(_standing_still), "The network never changes: optimizer.step() must follow backward()."),
+    "no-step": (_trained(stepping=False), "The network never changes: optimizer.step() must follow backward()."),
     "uphill": (
         _trained(loss=lambda loss_fn, outputs, actions: -loss_fn(outputs, actions), kept=lambda loss: -loss.detach()),
         "The loss grows: it is descended, not climbed, and a loss has its minus already.",
@@ -955,7 +878,10 @@ _WRONG_TRAIN_BC = {
         _trained(rows=lambda count, _batch_size, generator: torch.randperm(count, generator=generator)),
         "Each step takes all rows: batch_size says how many a minibatch has.",
     ),
-    "first-minibatch-only": (_trained(once=True), "The minibatch is drawn once, outside the loop: draw a new one for each step."),
+    "first-minibatch-only": (
+        _trained(one_minibatch=True),
+        "The minibatch is drawn once, outside the loop: draw a new one for each step.",
+    ),
     "rows-unpaired": (
         _trained(pair=lambda rows: torch.randperm(len(rows))),
         "Observations and actions are drawn separately: use the same indices for both, or no action belongs to its observation.",
@@ -966,7 +892,7 @@ _WRONG_TRAIN_BC = {
         "This minimises the squared error whatever the caller asks for: use loss_fn.",
     ),
     "copy-trained": (
-        _trained(trained=_copied),
+        _trained(network=copy.deepcopy),
         "A copy is trained, and the caller's network stays as it was: train the network itself, in place.",
     ),
     "epochs-for-steps": (
@@ -987,22 +913,17 @@ _WRONG_TRAIN_BC = {
     ),
 }
 
+_TRAINED: dict[str, Any] = {"returns": ("network",)}  # it is looked at after the call
+_FITTED: dict[str, Any] = _TRAINED | {"closed_form": _least_squares}
+
 TRAIN_BC = Exercise(
     name="train_bc",
     reference=ch74.train_bc,
     criteria={"values": 0.8, "gradient": 0.05, "inputs": 0.05, "errors": 0.1},
     cases=(
-        Case(
-            "a linear network on linear data", _regression(), closed_form=_least_squares, visible=True, returns=_NETWORK, atol=0.6
-        ),
-        Case(
-            "a row at a time, no noise",
-            _regression(batch_size=1, num_steps=48, noise=0.0),
-            closed_form=_least_squares,
-            returns=_NETWORK,
-            atol=1.0,
-        ),
-        Case("a loss of twice the output", _regression(gain=2.0, num_steps=16), returns=_NETWORK, atol=0.6),
+        Case("a linear network on linear data", _regression(), **_FITTED, visible=True, atol=0.6),
+        Case("a row at a time, no noise", _regression(batch_size=1, num_steps=48, noise=0.0), **_FITTED, atol=1.0),
+        Case("a loss of twice the output", _regression(gain=2.0, num_steps=16), **_TRAINED, atol=0.6),
         Case("the losses on the way", _lines, view="training_curve", dtype=torch.float32, visible=True),
         Case("a loss that counts the rows of its batch", _COUNTED, dtype=torch.float32, visible=True),
         Case(
@@ -1013,12 +934,7 @@ TRAIN_BC = Exercise(
             visible=True,
         ),
         Case("num_steps = 0", _regression(num_steps=0), raises=["num_steps"]),
-        Case(
-            "actions with a row too few",
-            reshaped(_regression(num_steps=2), "actions", lambda a: a[:-1]),
-            raises=["obs", "actions"],
-            visible=True,
-        ),
+        misshapen("actions with a row too few", _regression(), "actions", lambda x: x[:-1], ["obs", "actions"], visible=True),
     ),
     misconceptions=(
         *wrong(_WRONG_TRAIN_BC),
@@ -1040,12 +956,8 @@ TRAIN_BC = Exercise(
 # --------------------------------------------------------------------------------------------------------------- evaluate
 
 
-def _returns(pick=lambda returns, lengths: returns, checked=True, **mistake):
-    def version(policy, env, num_episodes, seed):
-        _, _, returns, lengths = _roll(policy, env, num_episodes, seed, **mistake)
-        return pick(returns, lengths)
-
-    return _rolled(version, checked)
+def _returns(returns=_sums, change=lambda returns: returns, checked=True, **mistake):
+    return _rolled(lambda *given: change(_paid(_episodes(*given, **mistake), returns)), checked)
 
 
 def _summed_afterwards(policy, env, num_episodes, seed):
@@ -1073,23 +985,16 @@ def _in_a_buffer(policy, env, num_episodes, seed):
     return returns
 
 
-_WRONG_EVALUATE = {
-    "averaged": (_returns(lambda returns, _: returns.mean()), "One return for each episode is asked for, (E,): average later."),
-    "discounted": (_returns(gamma=0.99), _DISCOUNT),
-    "reward-per-step": (_returns(lambda returns, lengths: returns / lengths), "A return is a sum of rewards, not their mean."),
-    "lengths-for-returns": (_returns(lambda _, lengths: lengths), _LENGTHS),
-    "last-reward-missing": (_returns(count_last=False), _LAST_REWARD),
-    "added-up": (_returns(carry=True), _ADDED_UP),
-    "same-seed-each-episode": (_returns(reset=lambda env, seed, _: env.reset(seed=seed)), _SAME_SEED),
-    "seeded-once": (_returns(reset=lambda env, seed, episode: env.reset(seed=None if episode else seed)), _SEEDED_ONCE),
-    "truncation-ignored": (_returns(ended=lambda terminated, _: terminated), _TRUNCATED),
-    "termination-ignored": (_returns(ended=lambda _, truncated: truncated), _TERMINATED),
-    "batch-axis-missing": (_returns(call=lambda policy, obs: policy(obs)), _BATCH),
-    "a-list-of-numbers": (_returns(lambda returns, _: returns.tolist()), "Return a tensor of shape (E,), not a list of numbers."),
-    "dtype-lost": (
-        _returns(lambda returns, _: returns.double()),
-        "The returns are to be float32; NumPy's own numbers are float64.",
+_WRONG_EVALUATE = _WRONG_LOOPS | {
+    "discounted": _DISCOUNTED,
+    "added-up": _ADDED_UP,
+    "averaged": ({"change": torch.mean}, "One return for each episode is asked for, (E,): average later."),
+    "reward-per-step": (
+        {"returns": lambda rewards: [sum(episode) / len(episode) for episode in rewards]},
+        "A return is a sum of rewards, not their mean.",
     ),
+    "a-list-of-numbers": ({"change": torch.Tensor.tolist}, "Return a tensor of shape (E,), not a list of numbers."),
+    "dtype-lost": ({"change": torch.Tensor.double}, "The returns are to be float32; NumPy's own numbers are float64."),
 }
 
 EVALUATE = Exercise(
@@ -1097,16 +1002,16 @@ EVALUATE = Exercise(
     reference=ch74.evaluate,
     criteria={"values": 0.75, "gradient": 0.05, "dtype": 0.1, "errors": 0.1},
     cases=(
-        Case("episodes that are cut off", _drive(_ROAD, _driver()), visible=True),
+        Case("episodes that are cut off", _drive(_ROAD, _driver), visible=True),
         Case("episodes that end off the road", _drive(_OPEN_ROAD, _weak, num_episodes=4), visible=True),
         Case("commands beyond ±1", _drive(_ROAD, _strong)),
         Case("discrete commands", _drive(_DISCRETE_ROAD, _three_commands), visible=True),
-        Case("a single episode", _drive(_ROAD, _driver(), num_episodes=1)),
-        Case("num_episodes = 0", _drive(_ROAD, _driver(), num_episodes=0), raises=["num_episodes"], visible=True),
+        Case("a single episode", _drive(_ROAD, _driver, num_episodes=1)),
+        _NO_EPISODE,
     ),
     misconceptions=(
-        *wrong(_WRONG_EVALUATE),
-        bad_input_accepted(_returns(checked=False), _EPISODES),
+        *wrong(_WRONG_EVALUATE, lambda mistake: _returns(**mistake)),
+        bad_input_accepted(_returns(checked=False), _EPISODES_NEEDED),
     ),
     variants={
         "rewards summed afterwards": _rolled(_summed_afterwards),
@@ -1134,39 +1039,34 @@ def _twice_the_same(generator):
 
 def _two_points(_generator):
     """Expert at 0 and 2 (deviation √2, or 1 if biased), agent at a third place, always."""
-    return {
-        "expert_obs": torch.tensor([[0.0], [2.0]], dtype=torch.float64),
-        "agent_obs": torch.full((3, 1), 4.0, dtype=torch.float64),
-    }
+    expert, agent = torch.tensor([[0.0], [2.0]], dtype=torch.float64), torch.full((3, 1), 4.0, dtype=torch.float64)
+    return {"expert_obs": expert, "agent_obs": agent}
+
+
+_SAMPLES = ("expert_obs", "agent_obs")
 
 
 def _apart(x, y):
     return (x[:, None] - y[None]).square().sum(-1).sqrt()
 
 
-def _energy(x, y, distance=_apart, own=torch.mean):
-    return 2 * distance(x, y).mean() - own(distance(x, x)) - own(distance(y, y))
+def _energy(x, y, distance=_apart, cross=2, own=torch.mean):
+    return cross * distance(x, y).mean() - own(distance(x, x)) - own(distance(y, y))
 
 
-def _others(distances):
-    """The mean over pairs of different points."""
-    count = len(distances)
-    return distances.sum() / (count * (count - 1))
-
-
-_comparable = satisfies(
-    lambda expert_obs, agent_obs: expert_obs.ndim == agent_obs.ndim == 2 and expert_obs.shape[1] == agent_obs.shape[1]
+_comparable = versions_of(
+    ch74.state_shift,
+    satisfies(lambda expert_obs, agent_obs: expert_obs.ndim == agent_obs.ndim == 2 and expert_obs.shape[1] == agent_obs.shape[1]),
 )
 
 
-def _shift(formula=_energy, scale=lambda expert, agent: expert.std(0), checked=True):
-    """A version: `formula` of both samples, after division by `scale`."""
+def _shift(formula=_energy, scale=lambda expert, agent: expert.std(0), scale_agent=None, checked=True):
+    """A version: `formula` of both samples, after division by `scale`; the agent's by another if it is said."""
 
-    def scaled(expert_obs, agent_obs):
-        scales = scale(expert_obs, agent_obs)
-        return formula(expert_obs / scales, agent_obs / scales)
+    def scaled(expert, agent):
+        return formula(expert / scale(expert, agent), agent / (scale_agent or scale)(expert, agent))
 
-    return versions_of(ch74.state_shift, _comparable)(scaled, checked)
+    return _comparable(scaled, checked)
 
 
 def _biased(expert, _agent):
@@ -1190,68 +1090,61 @@ def _weighted(x, y):
     return -(weights @ torch.cdist(both, both, compute_mode="donot_use_mm_for_euclid_dist") @ weights)
 
 
-_SHIFT_PAIR = ("expert_obs", "agent_obs")
+def _row_by_row(a, b):
+    return torch.stack([torch.linalg.vector_norm(row - b, dim=1) for row in a])
 
-_WRONG_STATE_SHIFT = {
+
+_WRONG_FORMULAS = {
     "factor-two-missing": (
-        _shift(lambda x, y: _apart(x, y).mean() - _apart(x, x).mean() - _apart(y, y).mean()),
+        lambda x, y: _energy(x, y, cross=1),
         "The mean distance between the samples counts twice: with once, equal samples are not at distance 0.",
     ),
     "cross-term-only": (
-        _shift(lambda x, y: _apart(x, y).mean()),
+        lambda x, y: _apart(x, y).mean(),
         "This is the mean distance between the samples, which is large for equal samples too: subtract the distances within each.",
     ),
     "self-pairs-excluded": (
-        _shift(lambda x, y: _energy(x, y, own=_others)),
+        lambda x, y: _energy(x, y, own=lambda d: d.sum() / (len(d) * (len(d) - 1))),
         "Within a sample all ordered pairs count, i = j included: divide by N², not by N (N - 1).",
     ),
     "halves-of-the-pairs": (
-        _shift(lambda x, y: _energy(x, y, own=lambda d: d.triu().sum() / d.numel())),
+        lambda x, y: _energy(x, y, own=lambda d: d.triu().sum() / d.numel()),
         "Ordered pairs: (i, j) and (j, i) both count, and here only one of them does.",
     ),
-    "not-scaled": (
-        _shift(scale=lambda expert, agent: 1.0),
-        "Nothing is scaled: the dimension with the largest unit decides alone.",
-    ),
-    "scaled-by-the-agent": (
-        _shift(scale=lambda expert, agent: agent.std(0)),
-        "Divide both by the *expert's* deviation: with its own, an agent that strays far looks close.",
-    ),
-    "each-by-its-own": (
-        lambda expert_obs, agent_obs: _shift(lambda x, y: _energy(x, y / agent_obs.std(0) * expert_obs.std(0)))(
-            expert_obs, agent_obs
-        ),
-        "Each sample is divided by its own deviation, which hides that one is wider: use the expert's for both.",
-    ),
-    "scaled-by-the-pooled": (
-        _shift(scale=lambda expert, agent: torch.cat([expert, agent]).std(0)),
-        "The deviation is that of both samples together, and grows with the shift: use the expert's alone.",
-    ),
-    "scaled-by-the-variance": (
-        _shift(scale=lambda expert, agent: expert.var(0)),
-        "Divide by the standard deviation, not by the variance: the result must not depend on the unit.",
-    ),
-    "one-scale-for-all": (
-        _shift(scale=lambda expert, agent: expert.std()),
-        "One deviation over all entries is used: each dimension has its own, std(0).",
-    ),
-    "root-taken": (
-        _shift(lambda x, y: _energy(x, y).clamp(min=0).sqrt()),
-        "The *squared* energy distance is asked for: take no root.",
-    ),
+    "root-taken": (lambda x, y: _energy(x, y).clamp(min=0).sqrt(), "The *squared* energy distance is asked for: take no root."),
     "distances-squared": (
-        _shift(lambda x, y: _energy(x, y, lambda a, b: _apart(a, b).square())),
+        lambda x, y: _energy(x, y, lambda a, b: _apart(a, b).square()),
         "The distances are squared: then only the means count, and two samples of one mean look equal however they differ.",
     ),
     "city-block": (
-        _shift(lambda x, y: _energy(x, y, lambda a, b: (a[:, None] - b[None]).abs().sum(-1))),
+        lambda x, y: _energy(x, y, lambda a, b: (a[:, None] - b[None]).abs().sum(-1)),
         "The distance is Euclidean: the root of the sum of squares over the dimensions.",
     ),
     "dimension-by-dimension": (
-        _shift(lambda x, y: torch.stack([_energy(x[:, [i]], y[:, [i]]) for i in range(x.shape[1])]).mean()),
+        lambda x, y: torch.stack([_energy(x[:, [i]], y[:, [i]]) for i in range(x.shape[1])]).mean(),
         "The dimensions are compared one by one, which cannot see how they belong together: use the distance of whole states.",
     ),
-    "sign-flipped": (_shift(lambda x, y: -_energy(x, y)), "The sign is flipped: the distances within are subtracted."),
+    "sign-flipped": (lambda x, y: -_energy(x, y), "The sign is flipped: the distances within are subtracted."),
+}
+
+_WRONG_SCALES = {
+    "not-scaled": (lambda expert, agent: 1.0, "Nothing is scaled: the dimension with the largest unit decides alone."),
+    "scaled-by-the-agent": (
+        lambda expert, agent: agent.std(0),
+        "Divide both by the *expert's* deviation: with its own, an agent that strays far looks close.",
+    ),
+    "scaled-by-the-pooled": (
+        lambda expert, agent: torch.cat([expert, agent]).std(0),
+        "The deviation is that of both samples together, and grows with the shift: use the expert's alone.",
+    ),
+    "scaled-by-the-variance": (
+        lambda expert, agent: expert.var(0),
+        "Divide by the standard deviation, not by the variance: the result must not depend on the unit.",
+    ),
+    "one-scale-for-all": (
+        lambda expert, agent: expert.std(),
+        "One deviation over all entries is used: each dimension has its own, std(0).",
+    ),
 }
 
 STATE_SHIFT = Exercise(
@@ -1267,16 +1160,17 @@ STATE_SHIFT = Exercise(
         Case("far apart", _clouds(moved=40.0), closed_form=_shift_by_hand),
         Case("a narrow agent", _clouds((9, 20), widened=0.1, moved=0.0), closed_form=_shift_by_hand),
         Case("single precision", _clouds(), dtype=torch.float32, visible=True),
-        Case(
-            "agent_obs with a dimension too few",
-            reshaped(_clouds(), "agent_obs", lambda x: x[:, :1]),
-            raises=_SHIFT_PAIR,
-            visible=True,
-        ),
-        Case("agent_obs as a single row", reshaped(_clouds(), "agent_obs", lambda x: x[0]), raises=_SHIFT_PAIR),
+        misshapen("agent_obs with a dimension too few", _clouds(), "agent_obs", lambda x: x[:, :1], _SAMPLES, visible=True),
+        misshapen("agent_obs as a single row", _clouds(), "agent_obs", lambda x: x[0], _SAMPLES),
     ),
     misconceptions=(
-        *wrong(_WRONG_STATE_SHIFT),
+        *wrong(_WRONG_FORMULAS, _shift),
+        *wrong(_WRONG_SCALES, lambda scale: _shift(scale=scale)),
+        Misconception(
+            "each-by-its-own",
+            _shift(scale_agent=lambda expert, agent: agent.std(0)),
+            "Each sample is divided by its own deviation, which hides that one is wider: use the expert's for both.",
+        ),
         python_float(ch74.state_shift, NUMBER),
         dtype_lost(ch74.state_shift),
         bad_input_accepted(
@@ -1288,14 +1182,8 @@ STATE_SHIFT = Exercise(
         "all differences at once": _shift(),
         "one quadratic form": _shift(_weighted),
         "cdist with the biased deviation": _shift(lambda x, y: _energy(x, y, torch.cdist), scale=_biased),
-        "standardised, one row at a time": _shift(
-            lambda x, y: _energy(
-                x - x.mean(0), y - x.mean(0), lambda a, b: torch.stack([torch.linalg.vector_norm(row - b, dim=1) for row in a])
-            )
-        ),
-        "in double precision": lambda expert_obs, agent_obs: _shift()(expert_obs.double(), agent_obs.double()).to(
-            expert_obs.dtype
-        ),
+        "standardised, one row at a time": _shift(lambda x, y: _energy(x - x.mean(0), y - x.mean(0), _row_by_row)),
+        "in double precision": _comparable(lambda expert, agent: _shift()(expert.double(), agent.double()).to(expert.dtype)),
     },
 )
 
@@ -1305,12 +1193,8 @@ STATE_SHIFT = Exercise(
 @drawing
 def _log(generator, lengths=(5, 4, 6), ids=None):
     """A suspect's log: the rows of three episodes, every number in it another one."""
-    size = sum(lengths)
-    return {
-        "obs": normal(generator, size, 3),
-        "actions": normal(generator, size, 2),
-        "episode_ids": _steps(lengths, ids),
-    }
+    obs, actions = normal(generator, sum(lengths), 3), normal(generator, sum(lengths), 2)
+    return {"obs": obs, "actions": actions, "episode_ids": _steps(lengths, ids)}
 
 
 _COLUMNS = ("obs", "actions", "episode_ids")
@@ -1328,7 +1212,7 @@ def _by_episode(join):
 
     def choose(obs, actions, ids):
         parts = [join(obs[ids == episode], actions[ids == episode]) for episode in dict.fromkeys(ids.tolist())]
-        return torch.cat([part[0] for part in parts]), torch.cat([part[1] for part in parts])
+        return tuple(torch.cat(column) for column in zip(*parts, strict=True))
 
     return choose
 
@@ -1341,14 +1225,22 @@ def _by_index(obs, actions, ids):
 def _by_mask(obs, actions, ids):
     last = torch.ones(len(ids), dtype=torch.bool)
     last[:-1] = ids.diff() != 0
-    first = last.roll(1)
-    return obs[~last], actions[~first]
+    return obs[~last], actions[~last.roll(1)]
+
+
+def _by_index_select(obs, actions, ids):
+    rows = _within(ids).nonzero().flatten()
+    return obs.index_select(0, rows), actions.index_select(0, rows + 1)
+
+
+def _sorted_by_episode(obs, actions, ids):
+    order = ids.argsort(stable=True)
+    return _by_index(obs[order], actions[order], ids[order])
 
 
 def _unchecked_pairs(obs, actions, ids):
     size = min(len(obs), len(actions), len(ids))
-    same = _within(ids[:size])
-    return obs[: size - 1][same], actions[1:size][same]
+    return _by_index(obs[:size], actions[:size], ids[:size])
 
 
 _WRONG_REPAIRED_PAIRS = {
@@ -1385,17 +1277,9 @@ _WRONG_REPAIRED_PAIRS = {
         lambda obs, actions, ids: (obs[ids == ids[0]][:-1], actions[ids == ids[0]][1:]),
         "All but the first episode are gone.",
     ),
-    "columns-swapped": (
-        lambda obs, actions, ids: (actions[1:][_within(ids)], obs[:-1][_within(ids)]),
-        "Return the observations first, then the actions.",
-    ),
-    "episodes-sorted": (
-        lambda obs, actions, ids: _by_episode(lambda o, a: (o[:-1], a[1:]))(
-            *(column[ids.argsort(stable=True)] for column in (obs, actions, ids))
-        ),
-        "The rows are sorted by the episodes' numbers: keep the order of the log.",
-    ),
-    "dtype-lost": (lambda obs, actions, ids: (obs[:-1][_within(ids)].float(), actions[1:][_within(ids)].float()), DTYPE),
+    "columns-swapped": (lambda *log: _by_index(*log)[::-1], "Return the observations first, then the actions."),
+    "episodes-sorted": (_sorted_by_episode, "The rows are sorted by the episodes' numbers: keep the order of the log."),
+    "dtype-lost": (lambda *log: tuple(column.float() for column in _by_index(*log)), DTYPE),
 }
 
 REPAIRED_PAIRS = Exercise(
@@ -1403,19 +1287,15 @@ REPAIRED_PAIRS = Exercise(
     reference=ch74.repaired_pairs,
     criteria={"values": 0.8, "dtype": 0.05, "inputs": 0.05, "errors": 0.1},
     cases=(
-        Case("three episodes", _log(), closed_form=_pairs(_by_index), visible=True),
-        Case("a single episode", _log((8,)), closed_form=_pairs(_by_index), visible=True),
-        Case("an episode of one step among others", _log((3, 1, 4, 1)), closed_form=_pairs(_by_index), visible=True),
-        Case("numbers with gaps, out of order", _log((4, 5, 3), [7, 2, 40]), closed_form=_pairs(_by_index)),
-        Case("many episodes", _log((3,) * 12), closed_form=_pairs(_by_index)),
-        Case("one pair", _log((1, 2, 1)), closed_form=_pairs(_by_index)),
+        Case("three episodes", _log(), closed_form=_by_index, visible=True),
+        Case("a single episode", _log((8,)), closed_form=_by_index, visible=True),
+        Case("an episode of one step among others", _log((3, 1, 4, 1)), closed_form=_by_index, visible=True),
+        Case("numbers with gaps, out of order", _log((4, 5, 3), [7, 2, 40]), closed_form=_by_index),
+        Case("many episodes", _log((3,) * 12), closed_form=_by_index),
+        Case("one pair", _log((1, 2, 1)), closed_form=_by_index),
         Case("single precision", _log(), dtype=torch.float32, visible=True),
-        Case("actions with a row too few", reshaped(_log(), "actions", lambda a: a[:-1]), raises=_COLUMNS, visible=True),
-        Case(
-            "episode_ids with a row too many",
-            reshaped(_log(), "episode_ids", lambda ids: torch.cat([ids, ids[-1:]])),
-            raises=_COLUMNS,
-        ),
+        misshapen("actions with a row too few", _log(), "actions", lambda x: x[:-1], _COLUMNS, visible=True),
+        misshapen("episode_ids with a row too many", _log(), "episode_ids", lambda x: torch.cat([x, x[-1:]]), _COLUMNS),
     ),
     misconceptions=(
         *wrong(_WRONG_REPAIRED_PAIRS, _pairs),
@@ -1428,12 +1308,7 @@ REPAIRED_PAIRS = Exercise(
         "episode by episode": _pairs(_by_episode(lambda obs, actions: (obs[:-1], actions[1:]))),
         "a list of indices": _pairs(_by_index),
         "masks of first and last rows": _pairs(_by_mask),
-        "index_select": _pairs(
-            lambda obs, actions, ids: (
-                obs.index_select(0, _within(ids).nonzero().flatten()),
-                actions.index_select(0, _within(ids).nonzero().flatten() + 1),
-            )
-        ),
+        "index_select": _pairs(_by_index_select),
     },
 )
 

@@ -70,3 +70,23 @@ def test_rows_are_cut_to_the_shortest_and_single_ones_repeated():
     assert x.tolist() == [[0, 1], [2, 3], [4, 5]] and y.tolist() == [0, 1, 2]
     assert single.tolist() == [[1, 1]] * 3 and scalar == 0.5
     assert parts.rows_cut(lambda one: one)(torch.ones(1)).tolist() == [1]
+
+
+def test_a_right_answer_is_spoilt_in_each_way_asked_for_and_in_place_only_where_an_argument_is_named():
+    named = parts.spoilt(_reference, parts.dtype_lost, parts.python_float, changed="y")
+    assert [mistake.name for mistake in named] == ["dtype-lost", "python-float", "input-changed"]
+    x, y = torch.ones((), dtype=torch.float64), torch.ones((), dtype=torch.float64)
+    assert named[0].function(x, y).dtype == torch.float32 and named[1].function(x, y) == 0.0
+    named[2].function(x, y)
+    named[2].function(x=x, y=y)
+    assert (x, y) == (1.0, 0.25)
+    assert parts.spoilt(_reference, parts.dtype_lost)[0].name == "dtype-lost" and not parts.spoilt(_reference)
+
+
+def test_a_misshapen_argument_is_to_be_refused_by_its_name_unless_others_are_given():
+    inputs = parts.drawing(lambda generator: {"x": parts.normal(generator, 3), "y": parts.normal(generator, 3)})()
+    case = parts.misshapen("y as a column", inputs, "y", lambda y: y[:, None], visible=True, draws=1)
+    drawn = case.inputs(torch.Generator().manual_seed(7))
+    assert (drawn["x"].shape, drawn["y"].shape) == ((3,), (3, 1))
+    assert (case.name, case.raises, case.facet, case.visible, case.draws) == ("y as a column", ["y"], "errors", True, 1)
+    assert parts.misshapen("y as a column", inputs, "y", lambda y: y[:, None], ("x", "y")).raises == ("x", "y")
