@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -16,13 +17,13 @@ from autograder.authoring.parts import (
     cut_from_graph,
     drawing,
     dtype_lost,
-    in_place,
     integers,
+    misshapen,
     normal,
     one_shape,
     replaced,
-    reshaped,
     satisfies,
+    spoilt,
     versions_of,
     wrong,
 )
@@ -41,6 +42,10 @@ HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 def _case(name, inputs, **options):
     """A case that is either visible or hidden, unless `draws` says otherwise: what it asks for is asked for in others, too."""
     return Case(name, inputs, **({"draws": 0 if options.get("visible") else 1} | options))
+
+
+def _misshapen(*given, visible=False):
+    return misshapen(*given, visible=visible, draws=0 if visible else 1)
 
 
 # ----------------------------------------------------------------------------------------------------- gaussian_log_prob
@@ -73,10 +78,9 @@ def _density_by_hand(mean, log_std, actions):
     return torch.tensor(sums, dtype=mean.dtype)
 
 
+_PAIR = ("mean", "actions")
 _densities = versions_of(
-    ch45.gaussian_log_prob,
-    one_shape("mean", "actions"),
-    satisfies(lambda log_std, mean: log_std.shape in (mean.shape, mean.shape[1:])),
+    ch45.gaussian_log_prob, one_shape(*_PAIR), satisfies(lambda log_std, mean: log_std.shape in (mean.shape, mean.shape[1:]))
 )
 
 
@@ -91,12 +95,6 @@ def _by_dimension(z, log_std):
 
 def _summed(z, log_std):
     return _by_dimension(z, log_std).sum(-1)
-
-
-def _log_of_densities(mean, log_std, actions):
-    std = log_std.exp()
-    densities = (-0.5 * ((actions - mean) / std) ** 2).exp() / (std * math.sqrt(2 * math.pi))
-    return densities.prod(-1).log()
 
 
 _WRONG_TERMS = {
@@ -145,8 +143,13 @@ _WRONG_TERMS = {
         "This is the negative log-likelihood, which one minimises. A ratio needs the log-probability itself.",
     ),
     "density-instead-of-logarithm": (lambda z, s: _summed(z, s).exp(), "This is the density itself; return its logarithm."),
+    "logarithm-of-the-density": (
+        lambda z, s: ((-0.5 * z**2).exp() / (s.exp() * math.sqrt(2 * math.pi))).prod(-1).log(),
+        "Far from the mean, or in many dimensions, the density is 0 to the computer and its logarithm is -inf: "
+        "add logarithms, never form the density.",
+    ),
     "log-std-clamped": (
-        lambda z, s: _by_dimension(z * (s - s.clamp(-20, 2)).exp(), s.clamp(-20, 2)).sum(-1),
+        lambda z, s: _summed(z * (s - s.clamp(-20, 2)).exp(), s.clamp(-20, 2)),
         "log_std is clamped here. Where a policy limits its width is the policy's affair: use log_std as it comes.",
     ),
 }
@@ -157,24 +160,19 @@ _WRONG_DENSITIES = {
         "log_std is the logarithm of the standard deviation: take its exponential before dividing.",
     ),
     "log-std-taken-as-log-variance": (
-        lambda m, s, a: _by_dimension((a - m) / (0.5 * s).exp(), 0.5 * s).sum(-1),
+        lambda m, s, a: _summed((a - m) / (0.5 * s).exp(), 0.5 * s),
         "log_std is log σ, not log σ²: the standard deviation is exp(log_std).",
     ),
     "variance-not-squared": (
         lambda m, s, a: (-0.5 * (a - m) ** 2 / s.exp() - s - HALF_LOG_TWO_PI).sum(-1),
         "The squared distance is divided by the variance σ², here it is divided by σ.",
     ),
-    "logarithm-of-the-density": (
-        _log_of_densities,
-        "Far from the mean, or in many dimensions, the density is 0 to the computer and its logarithm is -inf: "
-        "add logarithms, never form the density.",
-    ),
     "log-std-detached": (
-        lambda m, s, a: _by_dimension((a - m) / s.detach().exp(), s.detach()).sum(-1),
+        lambda m, s, a: _summed((a - m) / s.detach().exp(), s.detach()),
         "No gradient reaches log_std: the policy would never learn how much to explore.",
     ),
     "mean-detached": (
-        lambda m, s, a: _by_dimension((a - m.detach()) / s.exp(), s).sum(-1),
+        lambda m, s, a: _summed((a - m.detach()) / s.exp(), s),
         "No gradient reaches the mean: the policy would never learn what to do.",
     ),
 }
@@ -196,51 +194,26 @@ GAUSSIAN_LOG_PROB = Exercise(
         _case("mean and log_std require gradient", _actions(), differentiate=("mean", "log_std"), visible=True, draws=1),
         _case("log_std (B, A) requires gradient", _actions(per_sample=True), differentiate=("mean", "log_std")),
         _case("single precision", _actions(), dtype=torch.float32, visible=True),
-        _case(
-            "actions with a dimension too few",
-            reshaped(_actions(), "actions", lambda a: a[:, :1]),
-            raises=("actions", "mean"),
-            visible=True,
-        ),
-        _case("actions of one sample", reshaped(_actions(), "actions", lambda a: a[:1]), raises=("actions", "mean")),
-        _case(
-            "log_std for another number of dimensions",
-            reshaped(_actions(), "log_std", lambda s: s[:1]),
-            raises=("log_std",),
-            visible=True,
-        ),
-        _case(
-            "log_std as a column, one for each sample",
-            reshaped(_actions(per_sample=True), "log_std", lambda s: s[:, :1]),
-            raises=("log_std",),
-        ),
+        _misshapen("actions with a dimension too few", _actions(), "actions", lambda a: a[:, :1], _PAIR, visible=True),
+        _misshapen("actions of one sample", _actions(), "actions", lambda a: a[:1], _PAIR),
+        _misshapen("log_std for another number of dimensions", _actions(), "log_std", lambda s: s[:1], visible=True),
+        _misshapen("log_std as a column, one for each sample", _actions(per_sample=True), "log_std", lambda s: s[:, :1]),
     ),
     misconceptions=(
         *wrong(_WRONG_TERMS, _density),
         *wrong(_WRONG_DENSITIES, _densities),
-        dtype_lost(ch45.gaussian_log_prob),
-        in_place(_density(_summed), "actions", 2),
-        bad_input_accepted(_densities(lambda m, s, a: _by_dimension((a - m) / s.exp(), s).sum(-1), checked=False)),
+        *spoilt(ch45.gaussian_log_prob, dtype_lost, changed="actions"),
+        bad_input_accepted(_densities(lambda m, s, a: _summed((a - m) / s.exp(), s), checked=False)),
     ),
     variants={
         "torch.distributions": _densities(lambda m, s, a: Independent(Normal(m, s.exp()), 1).log_prob(a)),
         "torch.distributions, summed": _densities(lambda m, s, a: Normal(m, torch.exp(s)).log_prob(a).sum(dim=1)),
-        "one dimension after the other": _densities(
-            lambda m, s, a: sum(
-                _by_dimension((a[:, i] - m[:, i]) * (-s.expand_as(m)[:, i]).exp(), s.expand_as(m)[:, i])
-                for i in range(m.shape[1])
-            )
-        ),
+        "one dimension after the other": _density(lambda z, s: sum(map(_by_dimension, z.unbind(1), s.unbind(1)))),
         "variance and its logarithm": _densities(
             lambda m, s, a: -0.5 * ((a - m).square() / (2 * s).exp() + 2 * s + math.log(2 * math.pi)).sum(-1)
         ),
-        "one sample at a time, double precision inside": _densities(
-            lambda m, s, a: torch.stack(
-                [
-                    _by_dimension((x - y).double() / w.double().exp(), w.double()).sum()
-                    for x, y, w in zip(a, m, s.expand_as(m), strict=True)
-                ]
-            ).to(m.dtype)
+        "one sample at a time, double precision inside": _density(
+            lambda z, s: torch.stack(list(map(_summed, z.double(), s.double()))).to(z.dtype)
         ),
     },
 )
@@ -318,12 +291,7 @@ GAUSSIAN_ENTROPY = Exercise(
         _case("(B, A) requires gradient", _widths(5, 3), differentiate=("log_std",)),
         _case("single precision", _widths(3), dtype=torch.float32, visible=True),
     ),
-    misconceptions=(
-        *wrong(_WRONG_ENTROPIES),
-        cut_from_graph(ch45.gaussian_entropy),
-        dtype_lost(ch45.gaussian_entropy),
-        in_place(ch45.gaussian_entropy, "log_std"),
-    ),
+    misconceptions=(*wrong(_WRONG_ENTROPIES), *spoilt(ch45.gaussian_entropy, cut_from_graph, dtype_lost, changed="log_std")),
     variants={
         "torch.distributions": lambda log_std: Normal(torch.zeros_like(log_std), log_std.exp()).entropy().sum(-1),
         "Independent": lambda log_std: Independent(Normal(torch.zeros_like(log_std), log_std.exp()), 1).entropy(),
@@ -355,78 +323,29 @@ _sized = versions_of(
 )
 
 
-def _order(order, drop_last=False):
-    """A version of the function: `order` gives the indices from batch size and generator."""
-
-    def version(batch_size, minibatch_size, generator):
-        for batch in order(batch_size, generator).split(minibatch_size):
-            if not drop_last or len(batch) == minibatch_size:
-                yield batch
-
-    return _sized(version)
-
-
 def _permutation(size, generator):
     return torch.randperm(size, generator=generator)
 
 
-@_sized
-def _with_replacement_between_batches(batch_size, minibatch_size, generator):
-    for start in range(0, batch_size, minibatch_size):
-        yield torch.randperm(batch_size, generator=generator)[: min(minibatch_size, batch_size - start)]
+def _cut(cut=torch.Tensor.split, order=_permutation):
+    """A version: the `order` of all indices, and how it is `cut`."""
+    return _sized(lambda size, minibatch_size, generator: cut(order(size, generator), minibatch_size))
 
 
-@_sized
-def _last_batch_filled_up(batch_size, minibatch_size, generator):
-    order = torch.randperm(batch_size, generator=generator)
-    missing = -batch_size % minibatch_size
-    return iter(torch.cat([order, order[:missing]]).split(minibatch_size))
-
-
-@_sized
-def _shuffled_within(batch_size, minibatch_size, generator):
-    for block in torch.arange(batch_size).split(minibatch_size):
-        yield block[torch.randperm(len(block), generator=generator)]
-
-
-@_sized
-def _batches_shuffled(batch_size, minibatch_size, generator):
-    blocks = torch.arange(batch_size).split(minibatch_size)
-    return iter([blocks[i] for i in torch.randperm(len(blocks), generator=generator)])
-
-
-@_sized
-def _equal_parts(batch_size, minibatch_size, generator):
-    """As many batches as asked for, of equal sizes rather than of the size asked for."""
-    count = -(-batch_size // minibatch_size)
-    return iter(torch.randperm(batch_size, generator=generator).tensor_split(count))
-
-
-@_sized
-def _fisher_yates(batch_size, minibatch_size, generator):
-    order = list(range(batch_size))
-    for last in range(batch_size - 1, 0, -1):
+def _fisher_yates(size, generator):
+    order = list(range(size))
+    for last in range(size - 1, 0, -1):
         other = int(torch.randint(last + 1, (), generator=generator))
         order[last], order[other] = order[other], order[last]
-    for start in range(0, batch_size, minibatch_size):
-        yield torch.tensor(order[start : start + minibatch_size])
+    return torch.tensor(order)
 
 
-@_sized
-def _by_sorting(batch_size, minibatch_size, generator):
-    order = torch.rand(batch_size, generator=generator, dtype=torch.float64).argsort()
-    return (order[start : start + minibatch_size] for start in range(0, batch_size, minibatch_size))
-
-
-@_sized
-def _by_popping(batch_size, minibatch_size, generator):
-    left = _permutation(batch_size, generator)
+def _by_popping(left, minibatch_size):
     while len(left):
         yield left[:minibatch_size].clone()
         left = left[minibatch_size:]
 
 
-@_sized
 def _by_data_loader(batch_size, minibatch_size, generator):
     sampler = torch.utils.data.RandomSampler(range(batch_size), generator=generator)
     for batch in torch.utils.data.BatchSampler(sampler, minibatch_size, drop_last=False):
@@ -453,46 +372,43 @@ _WRONG_ORDERS = {
     ),
 }
 
-_WRONG_MINIBATCHES = {
+_WRONG_CUTS = {
     "last-batch-dropped": (
-        _order(_permutation, drop_last=True),
+        lambda order, size: [batch for batch in order.split(size) if len(batch) == size],
         "The short last batch is dropped: these samples are never used in this epoch. Keep it.",
     ),
     "last-batch-filled-up": (
-        _last_batch_filled_up,
+        lambda order, size: torch.cat([order, order[: -len(order) % size]]).split(size),
         "The last batch is filled up with indices that were there before: each index comes exactly once in an epoch.",
     ),
-    "new-order-for-each-batch": (
-        _with_replacement_between_batches,
-        "A fresh permutation for each batch forgets which samples were used: draw one for the whole epoch, and cut it.",
-    ),
-    "shuffled-within-batches": (
-        _shuffled_within,
-        "Each batch holds consecutive samples, only their order within it is random: shuffle first, then cut.",
-    ),
-    "batches-shuffled": (
-        _batches_shuffled,
-        "The batches come in random order, but each holds consecutive samples: shuffle first, then cut.",
-    ),
     "equal-parts": (
-        _equal_parts,
+        lambda order, size: order.tensor_split(-(-len(order) // size)),
         "The batches are of equal size rather than of the size asked for: only the last one may be shorter.",
     ),
     "one-tensor": (
-        _sized(lambda batch_size, _, generator: torch.randperm(batch_size, generator=generator)),
+        lambda order, size: order,
         "This is the whole order in one tensor: yield it piece by piece, minibatch_size indices at a time.",
     ),
     "lists-instead-of-tensors": (
-        lambda *given: (batch.tolist() for batch in ch45.minibatches(*given)),
+        lambda order, size: [batch.tolist() for batch in order.split(size)],
         "Each batch is a list of numbers: yield int64 tensors, which index other tensors without a detour.",
     ),
-    "not-int64": (
-        lambda *given: (batch.to(torch.int32) for batch in ch45.minibatches(*given)),
-        "Index tensors are int64 by contract.",
+    "not-int64": (lambda order, size: order.int().split(size), "Index tensors are int64 by contract."),
+    "counted-from-one": (lambda order, size: (order + 1).split(size), "Indices run from 0 to batch_size - 1."),
+}
+
+_WRONG_MINIBATCHES = {
+    "new-order-for-each-batch": (
+        lambda count, size, generator: [_permutation(count, generator)[: len(part)] for part in torch.arange(count).split(size)],
+        "A fresh permutation for each batch forgets which samples were used: draw one for the whole epoch, and cut it.",
     ),
-    "counted-from-one": (
-        lambda *given: (batch + 1 for batch in ch45.minibatches(*given)),
-        "Indices run from 0 to batch_size - 1.",
+    "shuffled-within-batches": (
+        lambda count, size, generator: [part[_permutation(len(part), generator)] for part in torch.arange(count).split(size)],
+        "Each batch holds consecutive samples, only their order within it is random: shuffle first, then cut.",
+    ),
+    "batches-shuffled": (
+        lambda count, size, generator: [torch.arange(count).split(size)[i] for i in _permutation(-(-count // size), generator)],
+        "The batches come in random order, but each holds consecutive samples: shuffle first, then cut.",
     ),
 }
 
@@ -513,21 +429,20 @@ MINIBATCHES = Exercise(
         _case("minibatch_size = -1", _epochs(16, -1), raises=("minibatch_size",)),
     ),
     misconceptions=(
-        *wrong(_WRONG_ORDERS, _order),
-        *wrong(_WRONG_MINIBATCHES),
+        *wrong(_WRONG_ORDERS, lambda order: _cut(order=order)),
+        *wrong(_WRONG_CUTS, _cut),
+        *wrong(_WRONG_MINIBATCHES, _sized),
         bad_input_accepted(
-            lambda size, minibatch_size, generator: torch.randperm(size, generator=generator).split(abs(minibatch_size) or size),
+            lambda size, minibatch_size, generator: _permutation(size, generator).split(abs(minibatch_size) or size),
             "Sizes below 1 make no minibatches: raise a ValueError that names the argument and its value.",
         ),
     ),
     variants={
-        "Fisher and Yates": _fisher_yates,
-        "sorting random numbers": _by_sorting,
-        "taking from what is left": _by_popping,
-        "torch's samplers": _by_data_loader,
-        "a list of slices": _sized(
-            lambda batch_size, minibatch_size, generator: list(_permutation(batch_size, generator).split(minibatch_size))
-        ),
+        "Fisher and Yates": _cut(order=_fisher_yates),
+        "sorting random numbers": _cut(order=lambda size, generator: torch.rand(size, generator=generator).argsort()),
+        "taking from what is left": _cut(_by_popping),
+        "torch's samplers": _sized(_by_data_loader),
+        "a list of slices": _cut(lambda order, size: [order[start : start + size] for start in range(0, len(order), size)]),
     },
 )
 
@@ -580,6 +495,7 @@ def _loss_by_hand(log_probs, old_log_probs, advantages, values, returns, entropy
 
 
 _COLUMNS = ("log_probs", "old_log_probs", "advantages", "values", "returns")
+_ALL = (*_COLUMNS, "entropy")
 _CHECKS = (
     one_shape(*_COLUMNS),
     satisfies(lambda entropy, log_probs: entropy.ndim == 0 or entropy.shape == log_probs.shape),
@@ -609,10 +525,10 @@ def _detached(found, _vf_coef, _ent_coef):
 def _parts(
     policy=clip,
     critic=_squared,
-    bonus=torch.mean,
     kl=_k3,
     outside=_share_outside,
-    total=lambda policy, critic, bonus, vf_coef, ent_coef: policy + vf_coef * critic - ent_coef * bonus,
+    weights=lambda vf_coef, ent_coef: (1, vf_coef, -ent_coef),
+    total=sum,
     log_ratio=lambda new, old: new - old,
     metrics=_detached,
     leaks=(),
@@ -622,31 +538,23 @@ def _parts(
 
     def loss(log_probs, old_log_probs, advantages, values, returns, entropy, clip_range, vf_coef, ent_coef):
         change = log_ratio(log_probs, old_log_probs)
-        losses = policy(change.exp(), advantages, clip_range), critic(values, returns), bonus(entropy)
+        losses = policy(change.exp(), advantages, clip_range), critic(values, returns), entropy.mean()
         found = dict(zip(("policy_loss", "value_loss", "entropy"), losses, strict=True))
         found |= {"approx_kl": kl(change.detach()), "clip_fraction": outside(change.detach(), clip_range)}
-        return total(*losses, vf_coef, ent_coef), metrics(found, vf_coef, ent_coef)
+        weighted = [weight * one for weight, one in zip(weights(vf_coef, ent_coef), losses, strict=True)]
+        return total(weighted), metrics(found, vf_coef, ent_coef)
 
     return versions_of(ch45.ppo_loss, *_CHECKS, data=[name for name in _DATA if name not in leaks])(loss, **options)
 
 
-@_losses
-def _one_by_one(log_probs, old_log_probs, advantages, values, returns, entropy, clip_range, vf_coef, ent_coef):
+def _one_by_one(ratios, advantages, clip_range):
     """A variant: a loop over samples that keeps the graph."""
-    policy, critic, kl, outside = [], [], [], []
-    for new, old, advantage, value, target in zip(log_probs, old_log_probs, advantages, values, returns, strict=True):
-        ratio = torch.exp(new - old)
-        free = ratio <= 1 + clip_range if advantage > 0 else ratio >= 1 - clip_range
+    losses = []
+    for ratio, advantage in zip(ratios, advantages, strict=True):
         bound = 1 + clip_range if advantage > 0 else 1 - clip_range
-        policy.append(-ratio * advantage if free else -bound * advantage + 0 * ratio)
-        critic.append((target - value) ** 2)
-        kl.append((ratio - 1 - (new - old)).detach())
-        outside.append(torch.abs(ratio.detach() - 1) > clip_range)
-    policy_loss, value_loss, bonus = torch.stack(policy).mean(), torch.stack(critic).mean(), entropy.mean()
-    found = {"policy_loss": policy_loss, "value_loss": value_loss, "entropy": bonus, "approx_kl": torch.stack(kl).mean()}
-    found["clip_fraction"] = torch.stack(outside).to(log_probs.dtype).mean()
-    loss = policy_loss + vf_coef * value_loss - ent_coef * bonus
-    return loss, {name: value.clone().detach() for name, value in found.items()}
+        free = ratio <= bound if advantage > 0 else ratio >= bound
+        losses.append(-(ratio if free else bound + 0 * ratio) * advantage)
+    return torch.stack(losses).mean()
 
 
 @_losses
@@ -716,19 +624,16 @@ _WRONG_PPO_LOSS = {
         "No gradient reaches the values: the critic would never learn.",
     ),
     "entropy-sign-wrong": (
-        _parts(total=lambda policy, critic, bonus, vf, ent: policy + vf * critic + ent * bonus),
+        _parts(weights=lambda vf, ent: (1, vf, ent)),
         "Adding the entropy to a loss makes the policy narrow as fast as it can: a bonus is subtracted.",
     ),
-    "entropy-left-out": (
-        _parts(total=lambda policy, critic, bonus, vf, ent: policy + vf * critic),
-        "The entropy bonus is reported but not part of the loss.",
-    ),
+    "entropy-left-out": (_parts(weights=lambda vf, ent: (1, vf, 0)), "The entropy bonus is reported but not part of the loss."),
     "coefficients-swapped": (
-        _parts(total=lambda policy, critic, bonus, vf, ent: policy + ent * critic - vf * bonus),
+        _parts(weights=lambda vf, ent: (1, ent, -vf)),
         "vf_coef weighs the value loss and ent_coef the entropy; here it is the other way round.",
     ),
     "value-coefficient-ignored": (
-        _parts(total=lambda policy, critic, bonus, vf, ent: policy + critic - ent * bonus),
+        _parts(weights=lambda vf, ent: (1, 1, -ent)),
         "The value loss counts in full, whatever vf_coef says.",
     ),
     "metrics-weighted": (
@@ -798,50 +703,40 @@ PPO_LOSS = Exercise(
         _case("clip_range = 1.5", _update(clip_range=1.5, spread=1.0), closed_form=_loss_by_hand),
         _case("clip_range = infinity", _update(clip_range=INF, spread=1.0), closed_form=_loss_by_hand),
         _case("very unlikely actions", _update(base=-900.0), closed_form=_loss_by_hand, visible=True),
-        _case("all inputs require gradient", _update(), differentiate=(*_COLUMNS, "entropy"), visible=True, draws=1),
-        _case(
-            "gradient with one entropy for all",
-            _update(shared_entropy=True, vf_coef=1.7, ent_coef=0.3),
-            differentiate=(*_COLUMNS, "entropy"),
-        ),
+        _case("all inputs require gradient", _update(), differentiate=_ALL, visible=True, draws=1),
+        _case("gradient with one entropy for all", _update(shared_entropy=True, vf_coef=1.7, ent_coef=0.3), differentiate=_ALL),
         _case("single precision", _update(), dtype=torch.float32, visible=True),
-        _case("entropy of one sample", reshaped(_update(), "entropy", lambda h: h[:1]), raises=("entropy",)),
-        _case("values as a column", reshaped(_update(), "values", lambda v: v[:, None]), raises=_COLUMNS, visible=True),
-        _case("returns of one sample", reshaped(_update(), "returns", lambda r: r[:1]), raises=_COLUMNS),
-        _case("advantages as a column", reshaped(_update(), "advantages", lambda a: a[:, None]), raises=_COLUMNS),
-        _case("old_log_probs of one sample", reshaped(_update(), "old_log_probs", lambda o: o[:1]), raises=_COLUMNS),
+        _misshapen("entropy of one sample", _update(), "entropy", lambda h: h[:1]),
+        _misshapen("values as a column", _update(), "values", lambda v: v[:, None], _COLUMNS, visible=True),
+        _misshapen("returns of one sample", _update(), "returns", lambda r: r[:1], _COLUMNS),
+        _misshapen("advantages as a column", _update(), "advantages", lambda a: a[:, None], _COLUMNS),
+        _misshapen("old_log_probs of one sample", _update(), "old_log_probs", lambda o: o[:1], _COLUMNS),
         _case("clip_range = -0.1", replaced(_update(), clip_range=-0.1), raises=("clip_range",), visible=True),
     ),
     misconceptions=(*wrong(_WRONG_PPO_LOSS), bad_input_accepted(_parts(checked=False))),
     variants={
         "torch's loss functions": _by_torch_functions,
-        "one sample at a time": _one_by_one,
+        "one sample at a time": _parts(
+            policy=_one_by_one, critic=lambda v, r: sum((x - y) ** 2 for x, y in zip(v, r, strict=True)) / len(v)
+        ),
         "mask of the saturated": _parts(policy=clip_by_mask),
         "excess past the bound, dot product": _parts(policy=clip_by_excess, critic=lambda v, r: (v - r) @ (v - r) / len(v)),
-        "the sum of one loss for each sample": _parts(
-            total=lambda policy, critic, bonus, vf, ent: torch.stack([policy, vf * critic, -ent * bonus]).sum()
-        ),
+        "the sum of one loss for each sample": _parts(total=lambda weighted: torch.stack(weighted).sum()),
     },
 )
 
 # ------------------------------------------------------------------------------------------------------- collect_rollout
 
 
-def _vector_env(maker, seed, steps=0, action=0.0, **options):
-    """A running vector environment, as an argument, and what it shows."""
-    env = built(f"control.envs.{maker}", **options)
-    running = environments.begun(getattr(environments, maker)(**options), seed, steps, action)
-    return built("control.envs.begun", envs=env, seed=seed, steps=steps, action=action), np.array(running.observe())
-
-
 @drawing
 def _collecting(generator, maker, num_steps, log_std=0.5, steps=0, action=0.0, **options):
-    """A rollout of `num_steps` steps with a wide policy; `steps` have been made before."""
+    """A rollout of `num_steps` steps with a wide policy, in environments in which `steps` have been made before."""
     seeds = integers(generator, 0, 2**31, 3).tolist()
-    envs, obs = _vector_env(maker, seeds[0], steps, action, **options)
+    begun = {"seed": seeds[0], "steps": steps, "action": action}
+    obs = np.array(environments.begun(getattr(environments, maker)(**options), **begun).observe())
     shape = {"obs_dim": obs.shape[1], "action_dim": 1, "hidden": 4}
     return {
-        "envs": envs,
+        "envs": built("control.envs.begun", envs=built(f"control.envs.{maker}", **options), **begun),
         "policy": built("control.policies.make_policy", log_std=log_std, seed=seeds[1], **shape),
         "num_steps": num_steps,
         "obs": obs,
@@ -862,69 +757,53 @@ def _clamped(envs, actions):
     return torch.clamp(actions, low, high).numpy()
 
 
+def _single(x):
+    return torch.as_tensor(x, dtype=torch.float32).clone()
+
+
 def _rollout(
     act=lambda policy, obs, generator: policy.act(obs, generator),
     executed=_bounded,
     successors=lambda obs, info, before: true_next_obs(obs, info),
-    recorded=lambda row: row,
+    seen=_single,
     last=lambda obs, row: obs,
     begin=lambda envs, obs: obs,
     extra_steps=0,
     finish=lambda rollout: rollout,
+    **changed,
 ):
-    """A version of the program, from the places where it can go wrong. `recorded` changes a row of the record."""
+    """A version of the program, from the places where it can go wrong; `changed` gives entries of a row of the record anew."""
 
     def version(envs, policy, num_steps, obs, generator):
         obs, rows = begin(envs, obs), []
         for _ in range(num_steps + extra_steps):
-            before = torch.as_tensor(obs, dtype=torch.float32).clone()
+            before = seen(obs)
             actions = act(policy, before, generator)
-            clipped = executed(envs, actions)
-            obs, rewards, terminated, truncated, info = envs.step(clipped)
+            sent = executed(envs, actions)
+            obs, rewards, terminated, truncated, info = envs.step(sent)
             row = {
                 "obs": before,
                 "actions": actions,
-                "executed": torch.as_tensor(clipped),
-                "rewards": torch.as_tensor(rewards, dtype=torch.float32),
-                "next_obs": torch.as_tensor(successors(obs, info, before), dtype=torch.float32).clone(),
-                "terminated": torch.as_tensor(terminated).clone(),
-                "truncated": torch.as_tensor(truncated).clone(),
+                "rewards": _single(rewards),
+                "next_obs": _single(successors(obs, info, before)),
+                "terminated": torch.tensor(terminated),
+                "truncated": torch.tensor(truncated),
             }
-            row["after"] = torch.as_tensor(obs, dtype=torch.float32).clone()
-            rows.append(recorded(row))
-        final = torch.as_tensor(last(obs, rows[-1]), dtype=torch.float32).clone()
-        names = ("obs", "actions", "rewards", "next_obs", "terminated", "truncated")
-        columns = {name: torch.stack([row[name] for row in rows]) for name in names}
-        return finish(Rollout(**columns, last_obs=final))
+            known = row | {"executed": torch.as_tensor(sent), "after": _single(obs)}
+            rows.append(row | {name: change(known) for name, change in changed.items()})
+        columns = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
+        return finish(Rollout(**columns, last_obs=_single(last(obs, rows[-1]))))
 
     return version
-
-
-def _recording(**changes):
-    """A row of the record in which some entries are functions of the row."""
-    return _rollout(recorded=lambda row: row | {name: change(row) for name, change in changes.items()})
 
 
 def _either_end(row):
     return row["terminated"] | row["truncated"]
 
 
-def _restarted(envs, _obs):
-    return envs.reset(seed=0)[0]
-
-
 def _columnwise(change):
     """A change of all columns of a rollout but last_obs."""
-
-    def changed(rollout):
-        columns = {name: change(column) for name, column in vars(rollout).items() if name != "last_obs"}
-        return Rollout(**columns, last_obs=rollout.last_obs)
-
-    return changed
-
-
-def _own_generator(policy, obs, _generator):
-    return policy.act(obs, torch.Generator().manual_seed(0))
+    return lambda rollout: replace(rollout, **{name: change(x) for name, x in vars(rollout).items() if name != "last_obs"})
 
 
 def _into_memory(envs, policy, num_steps, obs, generator):
@@ -944,23 +823,21 @@ def _into_memory(envs, policy, num_steps, obs, generator):
 
 
 def _columns_of_arrays(envs, policy, num_steps, obs, generator):
-    """A variant: lists of arrays, made tensors at the end."""
-    low, high = envs.single_action_space.low, envs.single_action_space.high
-    columns: dict[str, list] = {name: [] for name in ("obs", "actions", "rewards", "next_obs", "terminated", "truncated")}
+    """A variant: rows of arrays, made tensors at the end."""
+    rows = []
     for _ in range(num_steps):
-        columns["obs"].append(np.array(obs, np.float32))
+        before = np.array(obs, np.float32)
         with torch.no_grad():
-            actions = policy.act(columns["obs"][-1], generator).numpy()
+            actions = policy.act(before, generator).numpy()
+        low, high = envs.single_action_space.low, envs.single_action_space.high
         obs, rewards, terminated, truncated, info = envs.step(np.minimum(np.maximum(actions, low), high))
         successors = np.array(obs, np.float32)
         for i in range(len(successors)):
             if terminated[i] or truncated[i]:
                 successors[i] = info["final_obs"][i]
-        row = (actions, np.float32(rewards), successors, np.array(terminated), np.array(truncated))
-        for name, values in zip(list(columns)[1:], row, strict=True):
-            columns[name].append(values)
-    tensors = {name: torch.from_numpy(np.stack(rows)) for name, rows in columns.items()}
-    return Rollout(**tensors, last_obs=torch.from_numpy(np.array(obs, np.float32)))
+        rows.append((before, actions, np.float32(rewards), successors, np.array(terminated), np.array(truncated)))
+    columns = [torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True)]
+    return Rollout(*[*columns, torch.from_numpy(np.array(obs, np.float32))])
 
 
 _ENDS = "`terminated` and `truncated` are two facts, and one of them decides about the bootstrap: record both as they come."
@@ -975,18 +852,18 @@ _WRONG_ROLLOUTS = {
         "next_obs repeats obs: it is what the step has led to.",
     ),
     "obs-after-the-step": (
-        _recording(obs=lambda row: row["after"]),
+        _rollout(obs=lambda row: row["after"]),
         "obs shows the state after the action: record what the policy saw when it chose.",
     ),
-    "truncated-as-terminated": (_recording(terminated=_either_end), _ENDS),
-    "terminated-as-truncated": (_recording(truncated=_either_end), _ENDS),
-    "ends-swapped": (_recording(terminated=lambda row: row["truncated"], truncated=lambda row: row["terminated"]), _ENDS),
+    "truncated-as-terminated": (_rollout(terminated=_either_end), _ENDS),
+    "terminated-as-truncated": (_rollout(truncated=_either_end), _ENDS),
+    "ends-swapped": (_rollout(terminated=lambda row: row["truncated"], truncated=lambda row: row["terminated"]), _ENDS),
     "clipped-actions-recorded": (
-        _recording(actions=lambda row: row["executed"]),
+        _rollout(actions=lambda row: row["executed"]),
         "The actions are recorded as clipped. Their log-probability is then that of another action: record them as sampled.",
     ),
     "rewards-clipped": (
-        _recording(rewards=lambda row: row["rewards"].clamp(-1, 1)),
+        _rollout(rewards=lambda row: row["rewards"].clamp(-1, 1)),
         "The rewards are clipped to [-1, 1]: the actions are what has bounds. Record rewards as they come.",
     ),
     "mean-action": (
@@ -994,11 +871,11 @@ _WRONG_ROLLOUTS = {
         "The actions are the likeliest ones, not samples: without exploration every action is as good as expected.",
     ),
     "own-generator": (
-        _rollout(act=_own_generator),
+        _rollout(act=lambda policy, obs, _: policy.act(obs, torch.Generator().manual_seed(0))),
         "The actions are drawn from a generator made anew: the same noise at every step. Use the one that is given.",
     ),
     "restarted": (
-        _rollout(begin=_restarted),
+        _rollout(begin=lambda envs, _obs: envs.reset(seed=0)[0]),
         "The environments are reset at the beginning. A rollout goes on where the last one stopped: start from obs.",
     ),
     "last-obs-before-reset": (
@@ -1112,6 +989,11 @@ def _averaged(history):
     return {name: torch.stack([metrics[name] for metrics in history]).mean() for name in history[0]}
 
 
+def _loss(policy, rows, coefficients, old=lambda rows, _log_probs: rows.old_log_probs, weights=lambda rows: rows.advantages):
+    log_probs, entropy, values = ch45.evaluate_actions(policy, rows.obs, rows.actions)
+    return ch45.ppo_loss(log_probs, old(rows, log_probs), weights(rows), values, rows.returns, entropy, *coefficients)
+
+
 def _afresh(policy, loss):
     policy.weights.grad = None
     loss.backward()
@@ -1131,14 +1013,13 @@ def _from_zero(policy, loss):
 def _updating(
     epochs=lambda settings: settings.num_epochs,
     parts=_minibatches_of,
-    old=lambda rows, log_probs: rows.old_log_probs,
-    weights=lambda rows: rows.advantages,
     coefficients=_coefficients,
     differentiate=_afresh,
     longest=lambda settings: settings.max_grad_norm,
     stop_at="epoch",
     summary=_averaged,
     trained=lambda policy: policy,
+    **of_loss,
 ):
     """A version of the program, from the places where it can go wrong; it stops at the end of an epoch, in its midst, or never."""
 
@@ -1147,10 +1028,7 @@ def _updating(
         for _ in range(epochs(settings)):
             divergences = []
             for rows in parts(batch, settings, generator):
-                log_probs, entropy, values = ch45.evaluate_actions(policy, rows.obs, rows.actions)
-                before = old(rows, log_probs)
-                given = (log_probs, before, weights(rows), values, rows.returns, entropy, *coefficients(settings))
-                loss, metrics = ch45.ppo_loss(*given)
+                loss, metrics = _loss(policy, rows, coefficients(settings), **of_loss)
                 differentiate(policy, loss)
                 optimizer.step(policy, longest(settings))
                 history.append(metrics)
@@ -1171,10 +1049,7 @@ def _running_sums(policy, optimizer, batch, settings, generator):
     while epoch < settings.num_epochs and divergence <= settings.target_kl:
         order, start, divergence = torch.randperm(len(batch.obs), generator=generator), 0, 0.0
         while start < len(order):
-            rows = batch[order[start : start + settings.minibatch_size]]
-            log_probs, entropy, values = ch45.evaluate_actions(policy, rows.obs, rows.actions)
-            given = (log_probs, rows.old_log_probs, rows.advantages, values, rows.returns, entropy)
-            loss, metrics = ch45.ppo_loss(*given, *_coefficients(settings))
+            loss, metrics = _loss(policy, batch[order[start : start + settings.minibatch_size]], _coefficients(settings))
             loss.backward()
             optimizer.step(policy, settings.max_grad_norm)
             policy.weights.grad.zero_()
@@ -1186,6 +1061,7 @@ def _running_sums(policy, optimizer, batch, settings, generator):
 
 
 _AFTERWARDS = ("policy", "optimizer")
+_UNUSUAL = {"clip_range": 0.01, "vf_coef": 0.1, "ent_coef": 0.2, "max_grad_norm": 0.1}
 _STEPS = {"returns": ("optimizer",), "view": "steps_made"}
 
 _WRONG_PPO_UPDATE = {
@@ -1249,12 +1125,7 @@ PPO_UPDATE = Exercise(
     reference=ch45.ppo_update,
     criteria={"values": 1.0},
     cases=(
-        _case(
-            "the policy after two epochs",
-            _updated(clip_range=0.01, vf_coef=0.1, ent_coef=0.2, max_grad_norm=0.1),
-            returns=_AFTERWARDS,
-            visible=True,
-        ),
+        _case("the policy after two epochs", _updated(**_UNUSUAL), returns=_AFTERWARDS, visible=True),
         _case("an update that goes too far", _updated(target_kl=1e-4), returns=_AFTERWARDS),
         _case("the metrics", _updated(), visible=True),
         _case("the metrics of two minibatches, learning rate 0", _updated(12, 6, learning_rate=0.0), visible=True),
@@ -1278,32 +1149,20 @@ PPO_UPDATE = Exercise(
 # ----------------------------------------------------------------------------------------------- repaired_rollout (bug lab)
 
 
-def _overwritten(stack_at_the_end):
-    """The suspect program, and its cousin that stores references and stacks them at the end: both keep the environment's own array."""
-
-    def version(envs, policy, num_steps, obs, generator):
-        rows, kept = [], []
-        for _ in range(num_steps):
-            before = torch.as_tensor(obs, dtype=torch.float32)
-            actions = policy.act(before, generator)
-            obs, rewards, terminated, truncated, info = envs.step(_bounded(envs, actions))
-            rows.append((actions, torch.as_tensor(rewards), torch.as_tensor(true_next_obs(obs, info)), terminated, truncated))
-            kept.append(before if stack_at_the_end else before.clone())
-        columns = [torch.as_tensor(np.stack(column)) for column in zip(*rows, strict=True)]
-        return Rollout(*[torch.stack(kept), *columns, torch.as_tensor(obs).clone()])
-
-    return version
+def _shared(obs):
+    """The environment's own array, which its next step overwrites."""
+    return torch.as_tensor(obs, dtype=torch.float32)
 
 
 def _shifted(rollout):
     """obs made of the successors of the row before: right, but for the row after an end."""
-    return Rollout(**vars(rollout) | {"obs": torch.cat([rollout.obs[:1], rollout.next_obs[:-1]])})
+    return replace(rollout, obs=torch.cat([rollout.obs[:1], rollout.next_obs[:-1]]))
 
 
 def _rolled_actions(rollout):
     """The suspect's pairs mended from the other side: each observation with the action of the row after it."""
     successors = torch.cat([rollout.obs[1:], rollout.last_obs[None]])
-    return Rollout(**vars(rollout) | {"obs": successors, "actions": rollout.actions.roll(-1, dims=0)})
+    return replace(rollout, obs=successors, actions=rollout.actions.roll(-1, dims=0))
 
 
 def _blind(envs, policy, num_steps, obs, generator):
@@ -1315,11 +1174,11 @@ def _blind(envs, policy, num_steps, obs, generator):
 _STILL_WRONG = ("next-obs-after-reset", "truncated-as-terminated", "clipped-actions-recorded", "mean-action", "restarted")
 _WRONG_REPAIRS = {name: _WRONG_ROLLOUTS[name] for name in _STILL_WRONG} | {
     "the-suspects-own": (
-        _overwritten(stack_at_the_end=False),
+        _rollout(seen=_shared, obs=lambda row: row["obs"].clone()),
         "This is the suspect's record. Compare obs[t] with next_obs[t], row by row. What does the array in `obs` hold after the step?",
     ),
     "all-rows-alike": (
-        _overwritten(stack_at_the_end=True),
+        _rollout(seen=_shared),
         "All rows of obs are the last one: a list of references to one array. Copy before the next step, not at the end.",
     ),
     "shifted-by-hand": (
