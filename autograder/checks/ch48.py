@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
-from torch.nn import functional
+from torch.nn import functional as F
 
 from autograder.authoring.parts import (
     CUT,
@@ -26,6 +26,7 @@ from autograder.authoring.parts import (
     replaced,
     satisfies,
     shape_cases,
+    spoilt,
     uniform,
     versions_of,
     without,
@@ -48,11 +49,8 @@ _SQUASHED = ("mean", "log_std", "pre_tanh_actions")
 def _squashed(generator, size=7, dims=3, reach=1.0, base=-0.5):
     """Pre-activations at `reach` standard deviations from the mean or so."""
     mean, log_std = normal(generator, size, dims), base + 0.4 * normal(generator, size, dims)
-    return {
-        "mean": mean,
-        "log_std": log_std,
-        "pre_tanh_actions": mean + reach * log_std.exp() * normal(generator, size, dims),
-    }
+    drawn = mean + reach * log_std.exp() * normal(generator, size, dims)
+    return {"mean": mean, "log_std": log_std, "pre_tanh_actions": drawn}
 
 
 @drawing
@@ -88,7 +86,11 @@ def _normal(m, s, u):
 
 def _slope(u):
     """log(1 - tanh² u), stable."""
-    return 2 * (math.log(2) - u - functional.softplus(-2 * u))
+    return 2 * (math.log(2) - u - F.softplus(-2 * u))
+
+
+def _squashed_normal(m, s, u):
+    return (_normal(m, s, u) - _slope(u)).sum(-1)
 
 
 _density = versions_of(ch48.squashed_gaussian_log_prob, one_shape(*_SQUASHED))
@@ -153,7 +155,7 @@ _WRONG_SQUASHED_GAUSSIAN_LOG_PROB = {
         "Sum over the action's components, the last axis, not over the samples.",
     ),
     "actions-detached": (
-        lambda m, s, u: (_normal(m, s, u.detach()) - _slope(u.detach())).sum(-1),
+        lambda m, s, u: _squashed_normal(m, s, u.detach()),
         "No gradient passes through pre_tanh_actions. In SAC the action is a function of the policy's outputs, u = μ + σ ε, and"
         " without this path the policy's entropy never learns.",
     ),
@@ -185,32 +187,24 @@ SQUASHED_GAUSSIAN_LOG_PROB = Exercise(
     ),
     misconceptions=(
         *wrong(_WRONG_SQUASHED_GAUSSIAN_LOG_PROB, _density),
-        cut_from_graph(ch48.squashed_gaussian_log_prob),
-        dtype_lost(ch48.squashed_gaussian_log_prob),
-        in_place(ch48.squashed_gaussian_log_prob, "pre_tanh_actions", 2),
-        bad_input_accepted(_density(lambda m, s, u: (_normal(m, s, u) - _slope(u)).sum(-1), checked=False)),
+        *spoilt(ch48.squashed_gaussian_log_prob, cut_from_graph, dtype_lost, changed="pre_tanh_actions"),
+        bad_input_accepted(_density(_squashed_normal, checked=False)),
     ),
     variants={
         "distribution objects": _density(_distribution_object),
         "log cosh": _density(
-            lambda m, s, u: (
-                Normal(m, s.exp()).log_prob(u) + 2 * (u.abs() + torch.log1p(torch.exp(-2 * u.abs())) - math.log(2))
-            ).sum(-1)
+            lambda m, s, u: (Normal(m, s.exp()).log_prob(u) + 2 * (u.abs() + (-2 * u.abs()).exp().log1p() - math.log(2))).sum(-1)
         ),
         "logsigmoid": _density(
-            lambda m, s, u: (_normal(m, s, u) - math.log(4) - functional.logsigmoid(2 * u) - functional.logsigmoid(-2 * u)).sum(
-                -1
-            )
+            lambda m, s, u: (_normal(m, s, u) - math.log(4) - F.logsigmoid(2 * u) - F.logsigmoid(-2 * u)).sum(-1)
         ),
         "logaddexp, component by component": _density(
-            lambda m, s, u: sum(
-                _normal(m[:, i], s[:, i], u[:, i]) - 2 * (math.log(2) - torch.logaddexp(u[:, i], -u[:, i]))
-                for i in range(u.shape[1])
+            lambda *given: sum(
+                _normal(m, s, u) - 2 * (math.log(2) - torch.logaddexp(u, -u))
+                for m, s, u in zip(*(x.T for x in given), strict=True)
             )
         ),
-        "in double precision": _density(
-            lambda m, s, u: (_normal(m.double(), s.double(), u.double()) - _slope(u.double())).sum(-1).to(m.dtype)
-        ),
+        "in double precision": _density(lambda m, s, u: _squashed_normal(m.double(), s.double(), u.double()).to(m.dtype)),
     },
 )
 
@@ -251,7 +245,7 @@ _checked_target = versions_of(ch48.soft_q_target, one_shape(*_TARGET_SHAPES), sa
 
 
 def _target(formula, checked=True, detached=True):
-    """A version: `formula` takes r, goes_on (0 or 1 in r's dtype), q1, q2, log_probs, alpha, gamma."""
+    """A version: `formula` takes r, c (1 where the task goes on, else 0), q1, q2, log_probs, alpha, gamma."""
 
     def version(rewards, terminated, *others):
         result = formula(rewards, 1 - terminated.to(rewards.dtype), *others)
@@ -264,39 +258,41 @@ def _soft(r, c, q1, q2, lp, alpha, gamma):
     return r + gamma * c * (torch.minimum(q1, q2) - alpha * lp)
 
 
+def _worth(value):
+    """A version: `value` of what follows, from both critics and the entropy's worth h."""
+    return _target(lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * value(q1, q2, -alpha * lp))
+
+
 def _masked_assignment(r, c, q1, q2, lp, alpha, gamma):
     following = (torch.stack([q1, q2]).amin(0) - alpha * lp).clone()
     following[c == 0] = 0
     return r + gamma * following
 
 
-_WRONG_SOFT_Q_TARGET = {
+_WRONG_VALUES = {
     "maximum-of-the-critics": (
-        lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (torch.maximum(q1, q2) - alpha * lp),
+        lambda q1, q2, h: torch.maximum(q1, q2) + h,
         "This is the larger of the two values. The policy seeks out what is overestimated: the smaller one guards against that.",
     ),
     "mean-of-the-critics": (
-        lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (0.5 * (q1 + q2) - alpha * lp),
+        lambda q1, q2, h: 0.5 * (q1 + q2) + h,
         "This is the mean of the two values: the minimum is what guards against overestimation.",
     ),
-    "first-critic-only": (
-        lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (q1 - alpha * lp),
-        "next_q2 is not used: the target takes the smaller of the two values.",
-    ),
-    "second-critic-only": (
-        lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (q2 - alpha * lp),
-        "next_q1 is not used: the target takes the smaller of the two values.",
-    ),
+    "first-critic-only": (lambda q1, q2, h: q1 + h, "next_q2 is not used: the target takes the smaller of the two values."),
+    "second-critic-only": (lambda q1, q2, h: q2 + h, "next_q1 is not used: the target takes the smaller of the two values."),
     "entropy-missing": (
-        lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * torch.minimum(q1, q2),
+        lambda q1, q2, h: torch.minimum(q1, q2),
         "The next state's soft value is min(Q₁, Q₂) - α log π: the entropy term is missing, as in TD3.",
     ),
     "entropy-with-the-wrong-sign": (
-        lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (torch.minimum(q1, q2) + alpha * lp),
+        lambda q1, q2, h: torch.minimum(q1, q2) - h,
         "Randomness is rewarded: the entropy is -log π, so α log π is subtracted.",
     ),
+}
+
+_WRONG_SOFT_Q_TARGET = {
     "alpha-missing": (
-        lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (torch.minimum(q1, q2) - lp),
+        lambda r, c, q1, q2, lp, alpha, gamma: _soft(r, c, q1, q2, lp, 1.0, gamma),
         "alpha is not used: it is the price of a nat of entropy in units of reward.",
     ),
     "entropy-of-the-end": (
@@ -354,6 +350,7 @@ SOFT_Q_TARGET = Exercise(
         refused(_steps(), gamma=-0.1),
     ),
     misconceptions=(
+        *wrong(_WRONG_VALUES, _worth),
         *wrong(_WRONG_SOFT_Q_TARGET, _target),
         Misconception(
             "graph-kept",
@@ -361,17 +358,14 @@ SOFT_Q_TARGET = Exercise(
             "A target is data. With a graph, the critics' loss also pulls at the target networks, the policy and the temperature:"
             " compute it under torch.no_grad().",
         ),
-        dtype_lost(ch48.soft_q_target),
-        in_place(ch48.soft_q_target, "rewards"),
+        *spoilt(ch48.soft_q_target, dtype_lost, changed="rewards"),
         bad_input_accepted(_target(_soft, checked=False)),
     ),
     variants={
         "multiplied by 1 - terminated": _target(_soft),
         "logical not": _target(lambda r, c, q1, q2, lp, alpha, gamma: r + (c > 0) * gamma * (torch.min(q1, q2) - alpha * lp)),
         "filled with 0": _target(_masked_assignment),
-        "minimum by halves": _target(
-            lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * (0.5 * (q1 + q2 - (q1 - q2).abs()) - alpha * lp)
-        ),
+        "minimum by halves": _worth(lambda q1, q2, h: 0.5 * (q1 + q2 - (q1 - q2).abs()) + h),
         "step by step": _target(
             lambda r, c, q1, q2, lp, alpha, gamma: torch.stack(
                 [r[i] + (gamma * (min(q1[i], q2[i]) - alpha * lp[i]) if c[i] else torch.zeros_like(r[i])) for i in range(len(r))]
@@ -388,12 +382,8 @@ _ACTOR = ("q1", "q2", "log_probs")
 @drawing
 def _judged(generator, size=9, alpha=0.25):
     first = 3 + 4 * normal(generator, size)
-    return {
-        "q1": first,
-        "q2": first + 2 * normal(generator, size),
-        "log_probs": 1.0 + 2 * normal(generator, size),
-        "alpha": alpha,
-    }
+    second, log_probs = first + 2 * normal(generator, size), 1.0 + 2 * normal(generator, size)
+    return {"q1": first, "q2": second, "log_probs": log_probs, "alpha": alpha}
 
 
 _JUDGED_ALPHA_TENSOR = replaced(_judged(), alpha=torch.tensor(0.6, dtype=torch.float64))
@@ -412,45 +402,50 @@ def _soft_value(q1, q2, lp, alpha):
     return (alpha * lp - torch.minimum(q1, q2)).mean()
 
 
-_WRONG_SAC_ACTOR_LOSS = {
+def _gain(gain):
+    """A version: minus the mean of a `gain` from both critics and the entropy's worth h."""
+    return _actor(lambda q1, q2, lp, alpha: -gain(q1, q2, -alpha * lp).mean())
+
+
+_WRONG_GAINS = {
     "value-minimised": (
-        lambda q1, q2, lp, alpha: (alpha * lp + torch.minimum(q1, q2)).mean(),
+        lambda q1, q2, h: h - torch.minimum(q1, q2),
         "A loss is minimised: with +Q the policy learns the worst actions.",
     ),
     "entropy-minimised": (
-        lambda q1, q2, lp, alpha: (-alpha * lp - torch.minimum(q1, q2)).mean(),
+        lambda q1, q2, h: torch.minimum(q1, q2) - h,
         "The entropy is -log π, and minimising -α log π makes the policy less random: the sign is wrong.",
     ),
-    "objective-instead-of-loss": (
-        lambda q1, q2, lp, alpha: -_soft_value(q1, q2, lp, alpha),
-        "This is what the policy should maximise: a loss is minus that.",
-    ),
     "maximum-of-the-critics": (
-        lambda q1, q2, lp, alpha: (alpha * lp - torch.maximum(q1, q2)).mean(),
+        lambda q1, q2, h: torch.maximum(q1, q2) + h,
         "This is the larger of the two values: the policy would chase every overestimate.",
     ),
     "mean-of-the-critics": (
-        lambda q1, q2, lp, alpha: (alpha * lp - 0.5 * (q1 + q2)).mean(),
+        lambda q1, q2, h: 0.5 * (q1 + q2) + h,
         "This is the mean of the two values: take the smaller one, sample by sample.",
     ),
-    "first-critic-only": (
-        lambda q1, q2, lp, alpha: (alpha * lp - q1).mean(),
-        "q2 is not used: take the smaller of the two values, sample by sample.",
+    "first-critic-only": (lambda q1, q2, h: q1 + h, "q2 is not used: take the smaller of the two values, sample by sample."),
+    "entropy-missing": (
+        lambda q1, q2, h: torch.minimum(q1, q2),
+        "The entropy's worth is missing, and the policy's noise shrinks to nothing.",
+    ),
+}
+
+_WRONG_SAC_ACTOR_LOSS = {
+    "objective-instead-of-loss": (
+        lambda *given: -_soft_value(*given),
+        "This is what the policy should maximise: a loss is minus that.",
     ),
     "minimum-of-means": (
         lambda q1, q2, lp, alpha: (alpha * lp).mean() - torch.minimum(q1.mean(), q2.mean()),
         "The minimum is taken for each sample, before the mean: here one critic judges the whole batch.",
     ),
     "alpha-missing": (
-        lambda q1, q2, lp, alpha: (lp - torch.minimum(q1, q2)).mean(),
+        lambda q1, q2, lp, alpha: _soft_value(q1, q2, lp, 1.0),
         "alpha is not used: it is the price of a nat of entropy in units of reward.",
     ),
-    "entropy-missing": (
-        lambda q1, q2, lp, alpha: -torch.minimum(q1, q2).mean(),
-        "The entropy's worth is missing, and the policy's noise shrinks to nothing.",
-    ),
     "summed": (
-        lambda q1, q2, lp, alpha: (alpha * lp - torch.minimum(q1, q2)).sum(),
+        lambda *given: _soft_value(*given) * len(given[0]),
         "This is the sum over the batch: take the mean, or the step grows with the batch.",
     ),
     "value-detached": (
@@ -484,15 +479,14 @@ SAC_ACTOR_LOSS = Exercise(
         *shape_cases(_judged(), _ACTOR),
     ),
     misconceptions=(
+        *wrong(_WRONG_GAINS, _gain),
         *wrong(_WRONG_SAC_ACTOR_LOSS, _actor),
         Misconception(
             "gradient-into-alpha",
             _actor(_soft_value, leak=True),
             "alpha gets gradient from the policy's loss, which would drive it to 0 or beyond: it has a loss of its own.",
         ),
-        cut_from_graph(ch48.sac_actor_loss),
-        dtype_lost(ch48.sac_actor_loss),
-        in_place(ch48.sac_actor_loss, "q1"),
+        *spoilt(ch48.sac_actor_loss, cut_from_graph, dtype_lost, changed="q1"),
         bad_input_accepted(_actor(_soft_value, checked=False)),
     ),
     variants={
@@ -510,11 +504,8 @@ SAC_ACTOR_LOSS = Exercise(
 
 @drawing
 def _temperature(generator, size=9, log_alpha=-1.2, target_entropy=-3.0):
-    return {
-        "log_alpha": log_alpha + 0.3 * normal(generator),
-        "log_probs": 1.5 + 2 * normal(generator, size),
-        "target_entropy": target_entropy,
-    }
+    log_alpha, log_probs = log_alpha + 0.3 * normal(generator), 1.5 + 2 * normal(generator, size)
+    return {"log_alpha": log_alpha, "log_probs": log_probs, "target_entropy": target_entropy}
 
 
 def _on_target(generator):
@@ -586,9 +577,7 @@ TEMPERATURE_LOSS = Exercise(
     ),
     misconceptions=(
         *wrong(_WRONG_TEMPERATURE_LOSS),
-        python_float(ch48.temperature_loss),
-        dtype_lost(ch48.temperature_loss),
-        in_place(ch48.temperature_loss, "log_probs", 1),
+        *spoilt(ch48.temperature_loss, python_float, dtype_lost, changed="log_probs"),
     ),
     variants={
         "mean first": lambda log_alpha, lp, target: -log_alpha.exp() * (lp.detach().mean() + target),
@@ -639,21 +628,15 @@ def _polyak(step, checked=True, graph=False):
     return version
 
 
+def _moved(name, inputs, **options):
+    return Case(name, inputs, returns=("target_params",), **options)
+
+
 def _first_only(target_params, online_params, tau):
+    """Looks at all tensors, and moves the first."""
     targets, onlines = list(target_params), list(online_params)
+    _polyak(lambda target, online, tau: None)(targets, onlines, tau)
     ch48.polyak_update(targets[:1], onlines[:1], tau)
-    for target, online in zip(targets[1:], onlines[1:], strict=True):
-        if target.shape != online.shape:
-            raise ValueError(f"target_params {tuple(target.shape)} against online_params {tuple(online.shape)}")
-
-
-def _in_numpy(target, online, tau):
-    target.numpy()[...] = (1 - tau) * target.numpy() + tau * online.numpy()
-
-
-def _also_online(target, online, tau):
-    target.lerp_(online, tau)
-    online.copy_(target)
 
 
 def _used_up(target_params, online_params, tau):
@@ -664,53 +647,60 @@ def _used_up(target_params, online_params, tau):
             target.lerp_(online, tau)
 
 
-def _rebound(target, online, tau):
-    target = (1 - tau) * target + tau * online
+def _scaled_then_added(target, online, tau):
+    target.mul_(1 - tau).add_(online, alpha=tau)
+
+
+def _in_numpy(target, online, tau):
+    target.numpy()[...] = (1 - tau) * target.numpy() + tau * online.numpy()
 
 
 _NAMED = ("target", "online")  # the arguments, or their tensors
 
-_WRONG_POLYAK_UPDATE = {
+_WRONG_STEPS = {
     "tau-on-the-wrong-side": (
-        _polyak(lambda target, online, tau: target.lerp_(online, 1 - tau)),
+        lambda target, online, tau: target.lerp_(online, 1 - tau),
         "tau is the weight of the online parameters: with a small tau the targets move slowly, here they jump.",
     ),
     "copied": (
-        _polyak(lambda target, online, tau: target.copy_(online)),
+        lambda target, online, tau: target.copy_(online),
         "This copies the online parameters: the targets are to move by a share tau of the distance.",
     ),
     "added": (
-        _polyak(lambda target, online, tau: target.add_(tau * online)),
+        lambda target, online, tau: target.add_(tau * online),
         "The targets grow without bound: their old values are to be weighted with 1 - tau.",
     ),
     "moved-away": (
-        _polyak(lambda target, online, tau: target.sub_(tau * (online - target))),
+        lambda target, online, tau: target.sub_(tau * (online - target)),
         "The targets move away from the online parameters: the difference has the wrong sign.",
     ),
     "shrunk": (
-        _polyak(lambda target, online, tau: target.mul_(1 - tau)),
+        lambda target, online, tau: target.mul_(1 - tau),
         "The online parameters' share is missing: add tau times theirs.",
     ),
     "weights-in-sequence": (
-        _polyak(lambda target, online, tau: target.add_(tau * online).mul_(1 - tau)),
+        lambda target, online, tau: target.add_(tau * online).mul_(1 - tau),
         "The online share is shrunk by 1 - tau as well: multiply the targets first, then add.",
     ),
     "not-in-place": (
-        _polyak(_rebound),
+        lambda target, online, tau: (1 - tau) * target + tau * online,
         "target = … gives a name to a new tensor, and the network's own one stays as it is: use a method that ends in _.",
     ),
+    "online-changed": (
+        lambda target, online, tau: online.copy_(target.lerp_(online, tau)),
+        "The online parameters are changed as well: they are what is being learnt, leave them as they are.",
+    ),
+}
+
+_WRONG_POLYAK_UPDATE = {
     "checked-and-used-up": (
         _used_up,
         "The check goes through the parameters, and what can be gone through once, such as net.parameters(), has nothing left for the"
         " update: nothing moves. Do both in one loop.",
     ),
     "first-tensor-only": (_first_only, "Only the first tensor is moved: every pair is to be."),
-    "online-changed": (
-        _polyak(_also_online),
-        "The online parameters are changed as well: they are what is being learnt, leave them as they are.",
-    ),
     "graph-kept": (
-        _polyak(lambda target, online, tau: target.mul_(1 - tau).add_(tau * online), graph=True),
+        _polyak(_scaled_then_added, graph=True),
         "The update is recorded in the graph, which grows with every step, and PyTorch refuses to change parameters in place:"
         " do it under torch.no_grad().",
     ),
@@ -721,34 +711,29 @@ POLYAK_UPDATE = Exercise(
     reference=ch48.polyak_update,
     criteria={"values": 0.6, "gradient": 0.15, "dtype": 0.05, "inputs": 0.1, "errors": 0.1},
     cases=drawn_once(
-        Case("tau = 0.1", _networks(), returns=("target_params",), visible=True, draws=2),
-        Case("tau = 0.005", _networks(0.005), returns=("target_params",), visible=True),
-        Case("tau = 0.5: half-way", _networks(0.5), returns=("target_params",)),
-        Case("tau = 0: nothing moves", _networks(0.0), returns=("target_params",), visible=True),
-        Case("tau = 1: a copy", _networks(1.0), returns=("target_params",)),
-        Case("one tensor", _networks(0.2, shapes=((5,),)), returns=("target_params",)),
-        Case("online parameters require gradient", _networks(parameters=_PAIR[1:]), returns=("target_params",), visible=True),
-        Case("all parameters require gradient", _networks(parameters=_PAIR), returns=("target_params",), visible=True),
-        Case("online parameters as a module hands them out", _networks(once=_PAIR[1:]), returns=("target_params",), visible=True),
-        Case("single precision", _networks(), returns=("target_params",), dtype=torch.float32, visible=True),
-        Case(
-            "a tensor of one row in place of three",
-            _mismatch(lambda tensor: tensor[:1]),
-            returns=("target_params",),
-            raises=_NAMED,
-            visible=True,
-        ),
-        Case("a tensor without its last axis", _mismatch(lambda tensor: tensor[0]), returns=("target_params",), raises=_NAMED),
-        Case("a transposed tensor", _mismatch(lambda tensor: tensor.T), returns=("target_params",), raises=_NAMED),
-        Case("tau = 1.5", _networks(1.5), returns=("target_params",), raises=("tau",), visible=True),
-        Case("tau = -0.1", _networks(-0.1), returns=("target_params",), raises=("tau",)),
+        _moved("tau = 0.1", _networks(), visible=True, draws=2),
+        _moved("tau = 0.005", _networks(0.005), visible=True),
+        _moved("tau = 0.5: half-way", _networks(0.5)),
+        _moved("tau = 0: nothing moves", _networks(0.0), visible=True),
+        _moved("tau = 1: a copy", _networks(1.0)),
+        _moved("one tensor", _networks(0.2, shapes=((5,),))),
+        _moved("online parameters require gradient", _networks(parameters=_PAIR[1:]), visible=True),
+        _moved("all parameters require gradient", _networks(parameters=_PAIR), visible=True),
+        _moved("online parameters as a module hands them out", _networks(once=_PAIR[1:]), visible=True),
+        _moved("single precision", _networks(), dtype=torch.float32, visible=True),
+        _moved("a tensor of one row in place of three", _mismatch(lambda tensor: tensor[:1]), raises=_NAMED, visible=True),
+        _moved("a tensor without its last axis", _mismatch(lambda tensor: tensor[0]), raises=_NAMED),
+        _moved("a transposed tensor", _mismatch(lambda tensor: tensor.T), raises=_NAMED),
+        _moved("tau = 1.5", _networks(1.5), raises=("tau",), visible=True),
+        _moved("tau = -0.1", _networks(-0.1), raises=("tau",)),
     ),
     misconceptions=(
+        *wrong(_WRONG_STEPS, _polyak),
         *wrong(_WRONG_POLYAK_UPDATE),
-        bad_input_accepted(_polyak(lambda target, online, tau: target.mul_(1 - tau).add_(tau * online), checked=False)),
+        bad_input_accepted(_polyak(_scaled_then_added, checked=False)),
     ),
     variants={
-        "scaled, then added": _polyak(lambda target, online, tau: target.mul_(1 - tau).add_(online, alpha=tau)),
+        "scaled, then added": _polyak(_scaled_then_added),
         "by the difference": _polyak(lambda target, online, tau: target.add_(tau * (online - target))),
         "copied from a sum": _polyak(lambda target, online, tau: target.copy_((1 - tau) * target + tau * online)),
         "through .data": _polyak(
@@ -777,9 +762,30 @@ def _tasks_apart(generator, seeds=5, tasks=3):
 
 def _four_of_each(scores):
     """Every score four times: then a quarter of the entries is a whole number."""
-    ordered = np.sort(np.repeat(scores.numpy().ravel(), 4))
+    return torch.tensor(_middle_half(np.sort(np.repeat(scores.numpy().ravel(), 4))), dtype=scores.dtype)
+
+
+def _middle_half(ordered):
     quarter = len(ordered) // 4
-    return torch.tensor(ordered[quarter : len(ordered) - quarter].mean(), dtype=scores.dtype)
+    return ordered[quarter : 3 * quarter].mean(0)
+
+
+def _cut_by_weight(x, low, high=None):
+    """The mean of what is left when shares of the weight are cut off at both ends."""
+    count = len(x)
+    edges = torch.arange(count + 1, dtype=x.dtype).clamp(low * count, (1 - (low if high is None else high)) * count)
+    return edges.diff() @ x / edges.diff().sum()
+
+
+def _by_task(scores):
+    return torch.stack([ch48.interquartile_mean(column) for column in scores.reshape(len(scores), -1).unbind(1)])
+
+
+def _in_numpy_by_area(scores):
+    """The area between the quartiles under the quantile function."""
+    areas = np.concatenate([[0.0], np.cumsum(np.sort(scores.numpy().ravel()))]) / scores.numel()
+    ends = np.interp([0.25, 0.75], np.linspace(0, 1, scores.numel() + 1), areas)
+    return torch.tensor(2 * (ends[1] - ends[0]), dtype=scores.dtype)
 
 
 def _sorted(formula):
@@ -799,11 +805,8 @@ def _between_quartiles(x):
 def _quantile_integral(x):
     """The integral of the step function between 1/4 and 3/4."""
     count = len(x)
-    total = torch.zeros((), dtype=x.dtype)
-    for i in range(count):
-        overlap = min((i + 1) / count, 0.75) - max(i / count, 0.25)
-        total = total + max(overlap, 0.0) * x[i]
-    return 2 * total
+    overlaps = [min((i + 1) / count, 0.75) - max(i / count, 0.25) for i in range(count)]
+    return 2 * sum(max(overlap, 0.0) * x[i] for i, overlap in enumerate(overlaps))
 
 
 def _edges_in_part(x):
@@ -854,17 +857,11 @@ _WRONG_INTERQUARTILE_MEAN = {
         "The scores are cut in the order in which they came: sort them first.",
     ),
     "task-by-task": (
-        lambda scores: torch.stack(
-            [ch48.interquartile_mean(column) for column in scores.reshape(len(scores), -1).unbind(1)]
-        ).mean(),
+        lambda scores: _by_task(scores).mean(),
         "All entries are taken together: here each task is trimmed for itself, and a task without a middle counts as much.",
     ),
     "one-number-for-each-task": (
-        lambda scores: (
-            torch.stack([ch48.interquartile_mean(column) for column in scores.reshape(len(scores), -1).unbind(1)])
-            if scores.dim() > 1
-            else ch48.interquartile_mean(scores)
-        ),
+        lambda scores: _by_task(scores).squeeze(),
         "One number is asked for: flatten the scores before sorting.",
     ),
 }
@@ -887,37 +884,16 @@ INTERQUARTILE_MEAN = Exercise(
     ),
     misconceptions=(
         *wrong(_WRONG_INTERQUARTILE_MEAN),
-        python_float(ch48.interquartile_mean),
-        dtype_lost(ch48.interquartile_mean),
-        in_place(ch48.interquartile_mean, "scores"),
+        *spoilt(ch48.interquartile_mean, python_float, dtype_lost, changed="scores"),
     ),
     variants={
         "four of each": lambda scores: _middle_half(scores.flatten().repeat_interleave(4).sort().values),
         "integral of the quantile function": _sorted(_quantile_integral),
         "edges in part": _sorted(_edges_in_part),
-        "NumPy": lambda scores: torch.tensor(
-            np.interp([0.25, 0.75], np.linspace(0, 1, scores.numel() + 1), _cumulated(scores.numpy())) @ [-2.0, 2.0],
-            dtype=scores.dtype,
-        ),
+        "NumPy": _in_numpy_by_area,
         "topk": lambda scores: _edges_in_part(scores.flatten().topk(scores.numel(), largest=False).values),
     },
 )
-
-
-def _cut_by_weight(x, low, high=None):
-    """The mean of what is left when shares of the weight are cut off at both ends."""
-    count = len(x)
-    edges = torch.arange(count + 1, dtype=x.dtype).clamp(low * count, (1 - (low if high is None else high)) * count)
-    return edges.diff() @ x / edges.diff().sum()
-
-
-def _middle_half(ordered):
-    quarter = len(ordered) // 4
-    return ordered[quarter : 3 * quarter].mean()
-
-
-def _cumulated(scores):
-    return np.concatenate([[0.0], np.cumsum(np.sort(scores.ravel()))]) / scores.size
 
 
 # ------------------------------------------------------------------------------------------------------ bootstrap_interval
@@ -955,68 +931,54 @@ def _certain(scores, **_rest):
     return (ch48.interquartile_mean(scores),) * 2
 
 
-def _bootstrap(statistic=ch48.interquartile_mean, draw=None, tails=None, finish=None, own_generator=False):
-    """A version. `draw(by_task, count, generator)` gives (count, entries) resampled scores."""
-
-    def version(scores, confidence=0.95, num_resamples=2000, generator=None):
-        by_task = scores.reshape(len(scores), -1)
-        resampled = (draw or _stratified)(by_task, num_resamples, None if own_generator else generator)
-        means = statistic_of_rows(statistic, resampled)
-        low, high = tails(confidence) if tails else ((1 - confidence) / 2, (1 + confidence) / 2)
-        interval = means.quantile(low), means.quantile(high)
-        return finish(scores, means, *interval) if finish else interval
-
-    return version
-
-
-def statistic_of_rows(statistic, rows):
-    """The statistic of every row; the interquartile mean of all rows at once."""
-    if statistic is not ch48.interquartile_mean:
-        return statistic(rows)
+def _trimmed_rows(rows):
+    """The interquartile mean of every row at once."""
     count = rows.shape[1]
     edges = torch.arange(count + 1, dtype=rows.dtype).clamp(count / 4, 3 * count / 4)
     return rows.sort(1).values @ edges.diff() / (count / 2)
 
 
-def _stratified(by_task, count, generator):
-    picks = torch.randint(len(by_task), (count, *by_task.shape), generator=generator)
-    return by_task.gather(0, picks.flatten(0, 1)).view(count, -1)
+def _picked(by_task, count, generator, size=None):
+    """`count` resamples of `size` seeds (as many as there are) for each task apart: (count, size, tasks)."""
+    shape = (count, size or len(by_task), by_task.shape[1])
+    picks = torch.randint(len(by_task), shape, generator=generator)
+    return by_task.gather(0, picks.flatten(0, 1)).view(shape)
 
 
-def _pooled(by_task, count, generator):
-    entries = by_task.flatten()
-    return entries[torch.randint(len(entries), (count, len(entries)), generator=generator)]
+def _stratified(*given):
+    return _picked(*given).flatten(1)
 
 
-def _whole_rows(by_task, count, generator):
-    return by_task[torch.randint(len(by_task), (count, len(by_task)), generator=generator)].flatten(1)
+def _quantiles(means, confidence):
+    return means.quantile((1 - confidence) / 2), means.quantile((1 + confidence) / 2)
 
 
-def _shuffled(by_task, count, generator):
-    return _stratified(by_task, count, generator) * 0 + by_task.flatten()
+def _bootstrap(statistic=_trimmed_rows, draw=_stratified, ends=_quantiles, size=lambda num_resamples: num_resamples):
+    """A version: `draw(by_task, count, generator)` gives resampled scores, (count, entries); `ends` makes two of their `statistic`."""
+
+    def version(scores, confidence=0.95, num_resamples=2000, generator=None):
+        resampled = draw(scores.reshape(len(scores), -1), size(num_resamples), generator)
+        return ends(statistic(resampled), confidence)
+
+    return version
 
 
-def _half_as_many(by_task, count, generator):
-    picks = torch.randint(len(by_task), (count, max(len(by_task) // 2, 1), by_task.shape[1]), generator=generator)
-    return by_task.gather(0, picks.flatten(0, 1)).view(count, -1)
+def _and_centre(finish):
+    """A version: `finish` makes the interval of the scores' own interquartile mean and of the resampled ones."""
 
+    def version(scores, confidence=0.95, num_resamples=2000, generator=None):
+        centre = ch48.interquartile_mean(scores)
+        return _bootstrap(ends=lambda means, _: finish(centre, means, confidence))(scores, confidence, num_resamples, generator)
 
-def _task_means(by_task, count, generator):
-    """Each task's own interquartile mean, then their average."""
-    picks = torch.randint(len(by_task), (count, *by_task.shape), generator=generator)
-    drawn = by_task.gather(0, picks.flatten(0, 1)).view(count, *by_task.shape)
-    columns = [statistic_of_rows(ch48.interquartile_mean, column) for column in drawn.unbind(2)]
-    return torch.stack(columns, 1).mean(1, keepdim=True)
+    return version
 
 
 def _by_multinomial(by_task, count, generator):
     """Seeds as the outcomes of a multinomial with equal weights."""
     size = len(by_task)
-    columns = [
-        column[torch.multinomial(torch.ones(count, size), size, replacement=True, generator=generator)]
-        for column in by_task.unbind(1)
-    ]
-    return torch.cat(columns, 1)
+    weights = torch.ones(count, size)
+    picks = [torch.multinomial(weights, size, replacement=True, generator=generator) for _ in by_task.T]
+    return torch.cat([column[rows] for column, rows in zip(by_task.T, picks, strict=True)], 1)
 
 
 def _by_floor(by_task, count, generator):
@@ -1026,36 +988,25 @@ def _by_floor(by_task, count, generator):
     return torch.cat([by_task[picks[:, :, task], task] for task in range(tasks)], 1)
 
 
+def _by_numpy(by_task, count, generator):
+    """NumPy's generator, seeded from torch's."""
+    chance = np.random.default_rng(int(torch.randint(2**62, (1,), generator=generator)))
+    picks = chance.integers(len(by_task), size=(count, *by_task.shape))
+    return torch.from_numpy(np.take_along_axis(by_task.numpy()[None], picks, axis=1).reshape(count, -1))
+
+
+def _percentiles(means, confidence):
+    ends = np.percentile(means.numpy(), [50 * (1 - confidence), 50 * (1 + confidence)])
+    return tuple(torch.from_numpy(ends).to(means.dtype))
+
+
 def _task_by_task(scores, confidence=0.95, num_resamples=2000, generator=None):
     """Each score four times over, so that a quarter can be cut off; the interval's ends by counting."""
     by_task = scores.reshape(len(scores), -1)
     drawn = [column[torch.randint(len(column), (num_resamples, len(column)), generator=generator)] for column in by_task.T]
-    ordered = torch.cat(drawn, 1).repeat_interleave(4, 1).sort(1).values
-    quarter = ordered.shape[1] // 4
-    means = ordered[:, quarter : 3 * quarter].mean(1).sort().values
+    means = _middle_half(torch.cat(drawn, 1).repeat_interleave(4, 1).sort(1).values.T).sort().values
     tail = (1 - confidence) / 2
     return means[int(tail * num_resamples)], means[int((1 - tail) * num_resamples) - 1]
-
-
-def _in_numpy_by_seed(scores, confidence=0.95, num_resamples=2000, generator=None):
-    """NumPy's generator, seeded from torch's."""
-    chance = np.random.default_rng(int(torch.randint(2**62, (1,), generator=generator)))
-    by_task = scores.numpy().reshape(len(scores), -1)
-    picks = chance.integers(len(by_task), size=(num_resamples, *by_task.shape))
-    drawn = np.take_along_axis(by_task[None], picks, axis=1).reshape(num_resamples, -1)
-    means = statistic_of_rows(ch48.interquartile_mean, torch.from_numpy(drawn)).numpy()
-    low, high = np.percentile(means, [50 * (1 - confidence), 50 * (1 + confidence)])
-    return torch.tensor(low, dtype=scores.dtype), torch.tensor(high, dtype=scores.dtype)
-
-
-def _around_the_centre(scores, means, low, high):
-    centre, spread = ch48.interquartile_mean(scores), means.std() * 1.96
-    return centre - spread, centre + spread
-
-
-def _mirrored(scores, means, low, high):
-    centre = ch48.interquartile_mean(scores)
-    return 2 * centre - high, 2 * centre - low
 
 
 _WRONG_BOOTSTRAP_INTERVAL = {
@@ -1068,55 +1019,52 @@ _WRONG_BOOTSTRAP_INTERVAL = {
         "This is an interval for the median: bootstrap the interquartile mean.",
     ),
     "tasks-mixed": (
-        _bootstrap(draw=_pooled),
+        _bootstrap(draw=lambda x, count, g: x.flatten()[torch.randint(x.numel(), (count, x.numel()), generator=g)]),
         "Scores are drawn from all tasks together, so that a resample may hold one task twice as often as another, and the"
         " interval is too wide: draw seeds within each task.",
     ),
     "whole-rows": (
-        _bootstrap(draw=_whole_rows),
+        _bootstrap(draw=lambda x, count, g: x[torch.randint(len(x), (count, len(x)), generator=g)].flatten(1)),
         "The same seeds are drawn for all tasks, as if seed 3 of one task had anything to do with seed 3 of another: draw for each"
         " task apart.",
     ),
     "without-replacement": (
-        _bootstrap(draw=_shuffled),
+        _bootstrap(draw=lambda x, count, g: 0 * _stratified(x, count, g) + x.flatten()),
         "Every seed is drawn once, so that all resamples are the same and the interval has no width: draw with replacement.",
     ),
     "half-as-many": (
-        _bootstrap(draw=_half_as_many),
+        _bootstrap(draw=lambda x, count, g: _stratified(x, count, g, max(len(x) // 2, 1))),
         "A resample has as many seeds as there are: with fewer the interval is too wide.",
     ),
     "tasks-averaged": (
-        _bootstrap(statistic=lambda rows: rows[:, 0], draw=_task_means),
+        _bootstrap(lambda rows: torch.stack([_trimmed_rows(task) for task in rows.unbind(2)]).mean(0), draw=_picked),
         "Each task's interquartile mean is taken for itself: it is one mean over all entries of the resample.",
     ),
     "tails-not-halved": (
-        _bootstrap(tails=lambda confidence: (1 - confidence, confidence)),
+        _bootstrap(ends=lambda means, confidence: (means.quantile(1 - confidence), means.quantile(confidence))),
         "1 - confidence is left out at each end: it is half of that, as there are two ends.",
     ),
     "one-sided": (
-        _bootstrap(tails=lambda confidence: (0.0, confidence)),
+        _bootstrap(ends=lambda means, confidence: (means.min(), means.quantile(confidence))),
         "All that is left out is left out at the upper end: leave out (1 - confidence) / 2 at either end.",
     ),
     "extremes": (
-        _bootstrap(tails=lambda confidence: (0.0, 1.0)),
+        _bootstrap(ends=lambda means, _: (means.min(), means.max())),
         "The smallest and the largest resampled mean are returned, which move apart with the number of resamples: take the quantiles.",
     ),
     "normal-approximation": (
-        _bootstrap(finish=_around_the_centre),
+        _and_centre(lambda centre, means, _: (centre - 1.96 * means.std(), centre + 1.96 * means.std())),
         "Centre ± 1.96 standard deviations is symmetric and ignores `confidence`: a percentile interval takes quantiles of the"
         " resampled means.",
     ),
     "mirrored": (
-        _bootstrap(finish=_mirrored),
+        _and_centre(lambda centre, means, confidence: _quantiles(2 * centre - means, confidence)),
         "This is the basic bootstrap, which mirrors the interval at the centre: the percentile interval takes the quantiles as they are.",
     ),
-    "ends-swapped": (_bootstrap(finish=lambda scores, means, low, high: (high, low)), "The lower end comes first."),
-    "num-resamples-ignored": (
-        lambda scores, confidence=0.95, num_resamples=2000, generator=None: _bootstrap()(scores, confidence, 2000, generator),
-        "The number of resamples is fixed: draw num_resamples of them.",
-    ),
+    "ends-swapped": (_bootstrap(ends=lambda *given: _quantiles(*given)[::-1]), "The lower end comes first."),
+    "num-resamples-ignored": (_bootstrap(size=lambda _: 2000), "The number of resamples is fixed: draw num_resamples of them."),
     "own-generator": (
-        _bootstrap(own_generator=True),
+        _bootstrap(draw=lambda x, count, _: _stratified(x, count, None)),
         "Nothing is drawn from `generator`, so the interval is another one each time: hand it on to whatever draws.",
     ),
     "python-floats": (
@@ -1153,16 +1101,13 @@ BOOTSTRAP_INTERVAL = Exercise(
         Case("what is drawn from", _pattern(HALVES, num_resamples=20), returns=("generator",), view="drawn_from", visible=True),
         Case("single precision", _pattern(HALVES), dtype=torch.float32, visible=True, **_SPARE),
     ),
-    misconceptions=(
-        *wrong(_WRONG_BOOTSTRAP_INTERVAL),
-        in_place(ch48.bootstrap_interval, "scores"),
-    ),
+    misconceptions=(*wrong(_WRONG_BOOTSTRAP_INTERVAL), in_place(ch48.bootstrap_interval, "scores")),
     variants={
         "all resamples at once": _bootstrap(),
         "rounded uniform numbers": _bootstrap(draw=_by_floor),
         "task by task": _task_by_task,
         "multinomial": _bootstrap(draw=_by_multinomial),
-        "NumPy, seeded from the generator": _in_numpy_by_seed,
+        "NumPy, seeded from the generator": _bootstrap(draw=_by_numpy, ends=_percentiles),
     },
 )
 
@@ -1197,18 +1142,18 @@ _rewritten = versions_of(
 )
 
 
-def _kept(actions=None, ended=lambda terminated, truncated: terminated, checked=True, **columns):
+def _as_sampled(sent, low, high):
+    return 2 * (sent - low) / (high - low) - 1
+
+
+def _kept(actions=_as_sampled, ended=lambda terminated, truncated: terminated, checked=True, **columns):
     """A version: `actions(sent, low, high)` are those that are kept."""
 
     def version(obs, sent, rewards, next_obs, terminated, truncated, low, high):
-        kept = Transitions(obs, (actions or _as_sampled)(sent, low, high), rewards, next_obs, ended(terminated, truncated))
+        kept = Transitions(obs, actions(sent, low, high), rewards, next_obs, ended(terminated, truncated))
         return kept._replace(**{name: change(kept) for name, change in columns.items()})
 
     return _rewritten(version, checked)
-
-
-def _as_sampled(sent, low, high):
-    return 2 * (sent - low) / (high - low) - 1
 
 
 def _component_by_component(sent, low, high):
@@ -1222,51 +1167,55 @@ def _by_interpolation(sent, low, high):
     return torch.from_numpy(np.stack(columns, 1)).to(sent.dtype)
 
 
+_ABOVE = torch.full((2,), 5.0)  # any high
 _STUCK = torch.tensor([3.0, 0.5], dtype=torch.float64)  # the second motor's low, too
 
-_WRONG_REPAIRED_TRANSITIONS = {
+_WRONG_ACTIONS = {
     "as-sent": (
-        _kept(lambda sent, low, high: sent.clone()),
+        lambda sent, low, high: sent.clone(),
         "The buffer keeps what the environment was sent. The policy's actions lie in (-1, 1), and the critic is asked about those: it"
         " has to be taught about actions on the same scale.",
     ),
     "as-clipped": (
-        _kept(lambda sent, low, high: sent.clamp(-1, 1)),
+        lambda sent, low, high: sent.clamp(-1, 1),
         "Clipping commands to [-1, 1] makes many of them one and the same action, and moves none to where the policy meant it:"
         " undo the scaling.",
     ),
     "to-the-unit-interval": (
-        _kept(lambda sent, low, high: (sent - low) / (high - low)),
+        lambda sent, low, high: (sent - low) / (high - low),
         "These actions lie in [0, 1]: half of the range that the policy chooses from is missing.",
     ),
     "divided-by-the-upper-bound": (
-        _kept(lambda sent, low, high: sent / high),
+        lambda sent, low, high: sent / high,
         "Dividing by the upper bound is right only for bounds that are symmetric around 0.",
     ),
     "not-centred": (
-        _kept(lambda sent, low, high: 2 * sent / (high - low)),
+        lambda sent, low, high: 2 * sent / (high - low),
         "The middle of the motor's range is the policy's 0: subtract it before you scale.",
     ),
     "not-scaled": (
-        _kept(lambda sent, low, high: sent - 0.5 * (low + high)),
+        lambda sent, low, high: sent - 0.5 * (low + high),
         "The commands are centred, but not scaled: half of the range is 1.",
     ),
     "half-the-scale": (
-        _kept(lambda sent, low, high: (sent - 0.5 * (low + high)) / (high - low)),
+        lambda sent, low, high: (sent - 0.5 * (low + high)) / (high - low),
         "Divide by half of the range: these actions reach only from -0.5 to 0.5.",
     ),
     "upside-down": (
-        _kept(lambda sent, low, high: 1 - 2 * (sent - low) / (high - low)),
+        lambda sent, low, high: -_as_sampled(sent, low, high),
         "The lower bound is the policy's -1, the upper one its 1: these are exchanged.",
     ),
     "one-motor's-bounds-for-all": (
-        _kept(lambda sent, low, high: 2 * (sent - low[0]) / (high[0] - low[0]) - 1),
+        lambda sent, low, high: _as_sampled(sent, low[0], high[0]),
         "Every motor has bounds of its own: low and high are (A,), and broadcast over the steps.",
     ),
     "before-squashing": (
-        _kept(lambda sent, low, high: _as_sampled(sent, low, high).clamp(-1 + 1e-6, 1 - 1e-6).atanh()),
+        lambda sent, low, high: _as_sampled(sent, low, high).clamp(-1 + 1e-6, 1 - 1e-6).atanh(),
         "The critic is asked about actions after the hyperbolic tangent, in (-1, 1), not about pre-activations.",
     ),
+}
+
+_WRONG_REPAIRED_TRANSITIONS = {
     "truncated-taken-for-terminated": (
         _kept(ended=lambda terminated, truncated: terminated | truncated),
         "A time limit is no end of the task: the critic's target goes on there.",
@@ -1294,15 +1243,14 @@ REPAIRED_TRANSITIONS = Exercise(
         Case("symmetric bounds", _motor_steps(dims=1, low=(-2.0,), high=(2.0,))),
         Case("as many steps as motors", _motor_steps(size=2)),
         Case("single precision", _motor_steps(), dtype=torch.float32, visible=True),
-        Case(
-            "low above high", replaced(_motor_steps(), low=torch.full((2,), 5.0)), raises=["low", "high"], visible=True, draws=1
-        ),
+        Case("low above high", replaced(_motor_steps(), low=_ABOVE), raises=["low", "high"], visible=True, draws=1),
         Case("one motor that cannot move", replaced(_motor_steps(), high=_STUCK), raises=["low", "high"], draws=1),
         *shape_cases(_motor_steps(), _ROWS),
     ),
     misconceptions=(
+        *wrong(_WRONG_ACTIONS, _kept),
         *wrong(_WRONG_REPAIRED_TRANSITIONS),
-        in_place(ch48.repaired_transitions, "sent", 1),
+        *spoilt(ch48.repaired_transitions, changed="sent"),
         bad_input_accepted(_kept(checked=False)),
     ),
     variants={
