@@ -7,24 +7,23 @@ import math
 import numpy as np
 import torch
 from torch.distributions import Normal
-from torch.nn import functional
+from torch.nn import functional as F
 
 from autograder.authoring.parts import (
-    after,
     bad_input_accepted,
     cut_from_graph,
     drawing,
     drawn_once,
     dtype_lost,
-    in_place,
+    misshapen,
     normal,
     number,
     one_shape,
     python_float,
     refused,
-    reshaped,
     satisfies,
     shape_cases,
+    spoilt,
     uniform,
     versions_of,
     wrong,
@@ -81,6 +80,10 @@ def _terms(m, s, y):
     return 0.5 * (s + (y - m) ** 2 / s.exp() + LOG_TWO_PI)
 
 
+def _mean_of_terms(m, s, y):
+    return _terms(m, s, y).mean()
+
+
 def _averaged_prediction(m, s, y):
     """The ensemble as one model: mean of means, mean of variances."""
     y = y if y.dim() == 2 else y.mean(0)
@@ -128,7 +131,7 @@ _WRONG_GAUSSIAN_NLL = {
         lambda m, s, y: 0.5 * (s + (y - m) ** 2 / s.exp()).mean(),
         "The constant ½ log 2π is missing: it moves no gradient, but what is reported is no likelihood.",
     ),
-    "likelihood": (lambda m, s, y: -_terms(m, s, y).mean(), "This is the log-likelihood: a loss is minus that."),
+    "likelihood": (lambda *given: -_mean_of_terms(*given), "This is the log-likelihood: a loss is minus that."),
     "summed-over-dimensions": (
         lambda m, s, y: _terms(m, s, y).sum(-1).mean(),
         "The mean over every element is asked for: here the dimensions are summed.",
@@ -148,7 +151,7 @@ _WRONG_GAUSSIAN_NLL = {
         " disagreement no longer says where the model is unsure: each member is to be judged for itself.",
     ),
     "variance-detached": (
-        lambda m, s, y: _terms(m, s.detach(), y).mean(),
+        lambda m, s, y: _mean_of_terms(m, s.detach(), y),
         "No gradient reaches log_var: the model never learns how sure it may be.",
     ),
 }
@@ -167,41 +170,25 @@ GAUSSIAN_NLL = Exercise(
         Case("all inputs require gradient", _ensemble(), differentiate=_PREDICTED, visible=True, draws=2),
         Case("own samples, gradient", _ensemble(own_samples=True), differentiate=_PREDICTED),
         Case("single precision", _ensemble(), dtype=torch.float32, visible=True),
-        Case("log_var without its first member", reshaped(_ensemble(), "log_var", lambda x: x[1:]), raises=("log_var", "mean")),
-        Case(
-            "log_var the same for all members",
-            reshaped(_ensemble(), "log_var", lambda x: x[:1]),
-            raises=("log_var", "mean"),
-            visible=True,
-        ),
-        Case(
-            "targets with one dimension",
-            reshaped(_ensemble(), "targets", lambda x: x[:, :1]),
-            raises=("targets", "mean"),
-            visible=True,
-        ),
-        Case("targets of one sample", reshaped(_ensemble(), "targets", lambda x: x[:1]), raises=("targets", "mean")),
+        misshapen("log_var without its first member", _ensemble(), "log_var", lambda x: x[1:], ("log_var", "mean")),
+        misshapen("log_var the same for all members", _ensemble(), "log_var", lambda x: x[:1], ("log_var", "mean"), visible=True),
+        misshapen("targets with one dimension", _ensemble(), "targets", lambda x: x[:, :1], ("targets", "mean"), visible=True),
+        misshapen("targets of one sample", _ensemble(), "targets", lambda x: x[:1], ("targets", "mean")),
     ),
     misconceptions=(
         *wrong(_WRONG_GAUSSIAN_NLL, _nll),
-        Misconception(
-            "gradient-into-targets", _nll(lambda m, s, y: _terms(m, s, y).mean(), leak=True), "Targets are data: detach them."
-        ),
-        python_float(ch51.gaussian_nll),
-        dtype_lost(ch51.gaussian_nll),
-        in_place(ch51.gaussian_nll, "mean"),
-        bad_input_accepted(_nll(lambda m, s, y: _terms(m, s, y).mean(), checked=False)),
+        Misconception("gradient-into-targets", _nll(_mean_of_terms, leak=True), "Targets are data: detach them."),
+        *spoilt(ch51.gaussian_nll, python_float, dtype_lost, changed="mean"),
+        bad_input_accepted(_nll(_mean_of_terms, checked=False)),
     ),
     variants={
         "torch.distributions": _nll(lambda m, s, y: -Normal(m, (0.5 * s).exp()).log_prob(y).mean()),
-        "PyTorch's own loss": _nll(
-            lambda m, s, y: functional.gaussian_nll_loss(m, y.expand_as(m), s.exp(), full=True, eps=1e-12)
-        ),
+        "PyTorch's own loss": _nll(lambda m, s, y: F.gaussian_nll_loss(m, y.expand_as(m), s.exp(), full=True, eps=1e-12)),
         "member by member": _nll(
             lambda m, s, y: torch.stack([_terms(m[e], s[e], y if y.dim() == 2 else y[e]).mean() for e in range(len(m))]).mean()
         ),
         "terms apart": _nll(lambda m, s, y: 0.5 * s.mean() + 0.5 * ((y - m) * (-0.5 * s).exp()).pow(2).mean() + 0.5 * LOG_TWO_PI),
-        "in double precision": _nll(lambda m, s, y: _terms(m.double(), s.double(), y.double()).mean().to(m.dtype)),
+        "in double precision": _nll(lambda m, s, y: _mean_of_terms(m.double(), s.double(), y.double()).to(m.dtype)),
     },
 )
 
@@ -211,14 +198,8 @@ GAUSSIAN_NLL = Exercise(
 def _world(generator, obs_dim, action_dim, noise, limit):
     """A linear model and a linear policy, as descriptions; noise in one of them is noise in both."""
     dynamics = torch.eye(obs_dim, dtype=torch.float64) + 0.3 * normal(generator, obs_dim, obs_dim)
-    model = built(
-        "control.dynamics.LinearModel",
-        dynamics=dynamics,
-        control=normal(generator, action_dim, obs_dim),
-        noise=noise,
-        limit=limit,
-        drift=2.0,
-    )
+    control = normal(generator, action_dim, obs_dim)
+    model = built("control.dynamics.LinearModel", dynamics=dynamics, control=control, noise=noise, limit=limit, drift=2.0)
     return model, built("control.dynamics.LinearPolicy", gains=0.4 * normal(generator, obs_dim, action_dim), noise=noise)
 
 
@@ -239,9 +220,8 @@ def _ending(generator):
     trajectory goes on again."""
     drawn = _dreams(batch=4, obs_dim=2, action_dim=1, horizon=4)(generator)
     turn = torch.tensor([[0.0, 1.0], [-1.0, 0.0]], dtype=torch.float64)  # a quarter of a turn: the first component comes back
-    drawn["model"] = built(
-        "control.dynamics.LinearModel", dynamics=turn, control=torch.zeros(1, 2, dtype=torch.float64), limit=1.0, drift=2.0
-    )
+    control = torch.zeros(1, 2, dtype=torch.float64)
+    drawn["model"] = built("control.dynamics.LinearModel", dynamics=turn, control=control, limit=1.0, drift=2.0)
     start = 0.2 + 0.3 * uniform(generator, 4, 2)
     start[1, 1], start[2, 0] = 3.0, 5.0  # what is second now is first after a step; what is first, after two
     return drawn | {"start_obs": start}
@@ -255,39 +235,35 @@ def _view(name, inputs, **options):
     return Case(name, inputs, view="until_the_end", **options)
 
 
-def _stacked(obs, actions, rewards, continues):
-    return {
-        "obs": torch.stack(obs),
-        "actions": torch.stack(actions),
-        "rewards": torch.stack(rewards),
-        "continues": torch.stack(continues),
-    }
+_PARTS = ("obs", "actions", "rewards", "continues")
+
+
+def _stacked(*columns):
+    return {name: torch.stack(column) for name, column in zip(_PARTS, columns, strict=True)}
 
 
 def _dream(
     condition=lambda start, latest: latest,
     act=lambda policy, obs, generator: policy(obs, generator),
-    step=lambda model, obs, actions, generator: model(obs, actions, generator),
     ends=lambda alive, goes_on: alive * goes_on,
-    finish=lambda result: result,
-    before=lambda model, policy, obs, generator: None,
+    **changed,
 ):
-    """A version of imagine, each part of which can be another."""
+    """A version of imagine, each step of which can be another; `changed` gives parts of the result anew."""
 
     def version(model, policy, start_obs, horizon, generator):
         obs, actions, rewards, continues = [start_obs], [], [], []
         alive = torch.ones(len(start_obs), dtype=start_obs.dtype)
         for _ in range(horizon):
             seen = condition(start_obs, obs[-1])
-            before(model, policy, seen, generator)
             chosen = act(policy, seen, generator)
-            following, reward, goes_on = step(model, seen, chosen, generator)
+            following, reward, goes_on = model(seen, chosen, generator)
             alive = ends(alive, goes_on)
             obs.append(following)
             actions.append(chosen)
             rewards.append(reward)
             continues.append(alive)
-        return finish(_stacked(obs, actions, rewards, continues))
+        result = _stacked(obs, actions, rewards, continues)
+        return result | {name: change(result[name]) for name, change in changed.items()}
 
     return version
 
@@ -339,10 +315,6 @@ def _recursive(model, policy, start_obs, horizon, generator):
     return _stacked([start_obs, *obs], actions, rewards, continues)
 
 
-def _delayed(continues):
-    return torch.cat([torch.ones_like(continues[:1]), continues[:-1]])
-
-
 _WRONG_IMAGINE = {
     "always-from-the-start": (
         _dream(condition=lambda start, latest: start),
@@ -353,42 +325,33 @@ _WRONG_IMAGINE = {
         "A trajectory that has ended comes back to life as soon as the model finds its state harmless: once continues is 0, it stays 0.",
     ),
     "end-a-step-late": (
-        _dream(finish=lambda result: result | {"continues": _delayed(result["continues"])}),
+        _dream(continues=lambda x: torch.cat([torch.ones_like(x[:1]), x[:-1]])),
         "continues[t] says whether the trajectory goes on after step t, not whether it had ended before it.",
     ),
     "never-ends": (_dream(ends=lambda alive, goes_on: alive), "What the model says about the end is not used."),
     "ends-instead-of-continues": (
-        _dream(finish=lambda result: result | {"continues": 1 - result["continues"]}),
+        _dream(continues=lambda x: 1 - x),
         "This is 1 where the trajectory has ended: continues is 1 where it goes on.",
     ),
     "all-end-together": (
         _dream(ends=lambda alive, goes_on: alive * goes_on.min()),
         "Where one trajectory ends, all do here: each has its own end.",
     ),
-    "start-left-out": (
-        _dream(finish=lambda result: result | {"obs": result["obs"][1:]}),
-        "obs begins with start_obs: it has H + 1 entries.",
-    ),
+    "start-left-out": (_dream(obs=lambda x: x[1:]), "obs begins with start_obs: it has H + 1 entries."),
     "last-state-left-out": (
-        _dream(finish=lambda result: result | {"obs": result["obs"][:-1]}),
+        _dream(obs=lambda x: x[:-1]),
         "The state that the last step led to is missing: obs has H + 1 entries, and the last value is bootstrapped from it.",
     ),
-    "batch-first": (
-        _dream(finish=lambda result: {name: column.transpose(0, 1) for name, column in result.items()}),
-        "Time comes first: (H, B), not (B, H).",
-    ),
+    "batch-first": (_dream(**dict.fromkeys(_PARTS, lambda x: x.transpose(0, 1))), "Time comes first: (H, B), not (B, H)."),
     "policy-asked-twice": (
-        _dream(before=lambda model, policy, obs, generator: policy(obs, generator)),
+        _dream(act=lambda policy, obs, generator: [policy(obs, generator) for _ in range(2)][-1]),
         "The policy is called more than once in a step: what is recorded must be the action that the model was given.",
     ),
     "trajectory-by-trajectory": (
         _row_by_row,
         "The model is called for each trajectory apart: one call for the whole batch does the same in a fraction of the time.",
     ),
-    "dtype-lost": (
-        after(ch51.imagine, lambda result: {name: column.float() for name, column in result.items()}),
-        "The results have lost the dtype of start_obs.",
-    ),
+    "dtype-lost": (_dream(**dict.fromkeys(_PARTS, torch.Tensor.float)), "The results have lost the dtype of start_obs."),
 }
 
 IMAGINE = Exercise(
@@ -407,18 +370,12 @@ IMAGINE = Exercise(
         Case("calls of the model and of the policy", _dreams(noise=0.3), returns=("model", "policy"), visible=True),
         _view("single precision", _dreams(), dtype=torch.float32, visible=True),
     ),
-    misconceptions=(
-        *wrong(_WRONG_IMAGINE),
-        in_place(ch51.imagine, "start_obs", 2),
-    ),
+    misconceptions=(*wrong(_WRONG_IMAGINE), *spoilt(ch51.imagine, changed="start_obs")),
     variants={
         "into arrays made before": _filled,
         "frozen after the end": _frozen_after_the_end,
         "recursion": _recursive,
-        "cumulative product": _dream(
-            ends=lambda alive, goes_on: goes_on,
-            finish=lambda result: result | {"continues": result["continues"].cumprod(0)},
-        ),
+        "cumulative product": _dream(ends=lambda alive, goes_on: goes_on, continues=lambda x: x.cumprod(0)),
     },
 )
 
@@ -473,33 +430,29 @@ _dreamer = versions_of(
 )
 
 
-def _backwards(mix, last=lambda v: v[-1]):
-    """A recursion: `mix` takes r, v, c, what follows, gamma, lam of one step."""
+def _right(r, v, c, following, gamma, lam):
+    return r + gamma * c * ((1 - lam) * v + lam * following)
 
-    def formula(r, v, c, gamma, lam):
-        following = last(v)
+
+def _backwards(mix=_right, last=lambda v: v[-1], r=None, v=None, c=None):
+    """A recursion: `mix` takes r, v, c, what follows, gamma, lam of one step; `r`, `v` and `c` change the columns beforehand."""
+
+    def formula(rewards, values, continues, gamma, lam):
+        columns = [change(x) if change else x for change, x in ((r, rewards), (v, values), (c, continues))]
+        following = last(columns[1])
         found: list[torch.Tensor] = []
-        for t in reversed(range(min(len(r), len(v), len(c)))):
-            following = mix(r[t], v[t], c[t], following, gamma, lam)
+        for step in reversed(list(zip(*columns, strict=False))):
+            following = mix(*step, following, gamma, lam)
             found.insert(0, following)
         return torch.stack(found)
 
     return formula
 
 
-def _right(r, v, c, following, gamma, lam):
-    return r + gamma * c * ((1 - lam) * v + lam * following)
-
-
-def _values_of_the_same_state(r, v, c, gamma, lam):
-    """values[t] taken as the value before step t: the bootstrap is values[t + 1], and what is last has none left but itself."""
-    return _backwards(_right)(r, torch.cat([v[1:], v[-1:]]), c, gamma, lam)
-
-
 def _forwards(r, v, c, gamma, lam):
     following, found = v[0], []
-    for t in range(len(r)):
-        following = _right(r[t], v[t], c[t], following, gamma, lam)
+    for step in zip(r, v, c, strict=True):
+        following = _right(*step, following, gamma, lam)
         found.append(following)
     return torch.stack(found)
 
@@ -516,30 +469,24 @@ def _from_deltas(r, v, c, gamma, lam):
 
 def _by_matrix(r, v, c, gamma, lam):
     """The recursion is linear: solve for all steps at once."""
-    steps, batch = r.shape
-    share = lam * torch.ones(steps, 1, dtype=r.dtype)
+    share = torch.full_like(r, lam)
     share[-1] = 0
     constant = r + gamma * c * (1 - share) * v
-    columns = []
-    for b in range(batch):
-        coupling = torch.diag((gamma * c[:, b] * share[:, 0])[:-1], 1) if steps > 1 else torch.zeros(1, 1, dtype=r.dtype)
-        columns.append(torch.linalg.solve(torch.eye(steps, dtype=r.dtype) - coupling, constant[:, b]))
-    return torch.stack(columns, 1)
+    coupling = torch.diag_embed((gamma * c * share)[:-1].T, 1)  # of each step to the next, one matrix for each trajectory
+    return torch.linalg.solve(torch.eye(len(r), dtype=r.dtype) - coupling, constant.T).T
 
 
 _WRONG_DREAMER_LAMBDA_RETURNS = {
     "values-of-the-state-before": (
-        _values_of_the_same_state,
+        _backwards(v=lambda v: torch.cat([v[1:], v[-1:]])),
         "values[t] belongs to the state that rewards[t] led to: it is what bootstraps step t. Here values[t + 1] does.",
     ),
     "last-value-forgotten": (
-        _backwards(_right, last=lambda v: torch.zeros_like(v[-1])),
+        _backwards(last=lambda v: torch.zeros_like(v[-1])),
         "Behind the horizon stands nothing here: the last return bootstraps from values[-1] alone, with no 1 - λ before it.",
     ),
     "no-bootstrap-at-the-end": (
-        lambda r, v, c, gamma, lam: (
-            torch.cat([_backwards(_right)(r[:-1], v[:-1], c[:-1], gamma, lam), r[-1:]]) if len(r) > 1 else r.clone()
-        ),
+        lambda r, v, c, *rest: torch.cat([_backwards()(r[:-1], v[:-1], c[:-1], *rest), r[-1:]]) if len(r) > 1 else r.clone(),
         "The last return is its reward only: it bootstraps from values[-1], and the returns before it go on from there.",
     ),
     "lam-swapped": (
@@ -559,11 +506,11 @@ _WRONG_DREAMER_LAMBDA_RETURNS = {
         "After an end the following returns still count: continues multiplies both, the value and the return that follows.",
     ),
     "end-of-the-next-step": (
-        lambda r, v, c, gamma, lam: _backwards(_right)(r, v, torch.cat([c[1:], torch.ones_like(c[:1])]), gamma, lam),
+        _backwards(c=lambda c: torch.cat([c[1:], torch.ones_like(c[:1])])),
         "continues[t] belongs to step t: here that of step t + 1 is used.",
     ),
     "end-taken-as-flag": (
-        lambda r, v, c, gamma, lam: _backwards(_right)(r, v, (c > 0.5).to(r.dtype), gamma, lam),
+        _backwards(c=lambda c: (c > 0.5).to(c.dtype)),
         "continues may be a probability: multiply by it, do not round it.",
     ),
     "gamma-missing": (
@@ -584,16 +531,16 @@ _WRONG_DREAMER_LAMBDA_RETURNS = {
     ),
     "one-step-only": (lambda r, v, c, gamma, lam: r + gamma * c * v, "lam is not used: these are one-step targets."),
     "advantages": (
-        lambda r, v, c, gamma, lam: _backwards(_right)(r, v, c, gamma, lam) - v,
+        lambda r, v, *rest: _backwards()(r, v, *rest) - v,
         "values are subtracted: the returns themselves are asked for.",
     ),
     "forwards": (_forwards, "Time runs the wrong way: a return depends on what comes after, so begin with the last step."),
     "order-reversed": (
-        lambda r, v, c, gamma, lam: _backwards(_right)(r, v, c, gamma, lam).flip(0),
+        lambda *given: _backwards()(*given).flip(0),
         "The returns come in the order in which they were computed, last step first: turn them round.",
     ),
     "values-detached": (
-        lambda r, v, c, gamma, lam: _backwards(_right)(r, v.detach(), c, gamma, lam),
+        _backwards(v=torch.Tensor.detach),
         "No gradient reaches values: Dreamer's policy learns through them what lies behind the horizon.",
     ),
 }
@@ -623,14 +570,12 @@ DREAMER_LAMBDA_RETURNS = Exercise(
     ),
     misconceptions=(
         *wrong(_WRONG_DREAMER_LAMBDA_RETURNS, _dreamer),
-        cut_from_graph(ch51.dreamer_lambda_returns),
-        dtype_lost(ch51.dreamer_lambda_returns),
-        in_place(ch51.dreamer_lambda_returns, "values", 1),
-        bad_input_accepted(_dreamer(_backwards(_right), checked=False)),
+        *spoilt(ch51.dreamer_lambda_returns, cut_from_graph, dtype_lost, changed="values"),
+        bad_input_accepted(_dreamer(_backwards(), checked=False)),
     ),
     variants={
         "sum of n-step returns": _dreamer(_as_sum),
-        "recursion by indices": _dreamer(_backwards(_right)),
+        "recursion by indices": _dreamer(_backwards()),
         "corrections on one-step targets": _dreamer(_from_deltas),
         "linear system": _dreamer(_by_matrix),
         "difference form": _dreamer(_backwards(lambda r, v, c, f, gamma, lam: r + gamma * c * (v + lam * (f - v)))),
@@ -665,31 +610,35 @@ def _perfect(generator):
 
 
 _forecast = versions_of(
-    ch51.model_error_by_horizon,
-    satisfies(lambda obs, actions: len(obs) == len(actions) + 1 and obs.shape[1] == actions.shape[1]),
+    ch51.model_error_by_horizon, satisfies(lambda obs, actions: len(obs) == len(actions) + 1 and obs.shape[1] == actions.shape[1])
 )
 
 
-def _error(measure, predict=lambda model, predicted, real, taken, generator: model(predicted, taken, generator)[0], checked=True):
-    """A version: `measure` takes predictions and truth, (H, B, O) each."""
+def _root_mean_square(gaps):
+    return gaps.square().mean((1, 2)).sqrt()
+
+
+def _error(
+    measure=_root_mean_square,
+    predict=lambda model, predicted, real, taken, generator: model(predicted, taken, generator)[0],
+    act=lambda actions: actions,
+    checked=True,
+):
+    """A version: `measure` takes predictions minus truth, (H, B, O)."""
 
     def version(model, obs, actions, generator):
         latest, predictions = obs[0], []
-        for t in range(len(actions)):
-            latest = predict(model, latest, obs[t], actions[t], generator)
+        for real, taken in zip(obs, act(actions), strict=False):
+            latest = predict(model, latest, real, taken, generator)
             predictions.append(latest)
-        return measure(torch.stack(predictions), obs[1 : len(actions) + 1])
+        return measure(torch.stack(predictions) - obs[1 : len(actions) + 1])
 
     return _forecast(version, checked)
 
 
-def _root_mean_square(predictions, real):
-    return (predictions - real).square().mean((1, 2)).sqrt()
-
-
-def _numpy_errors(predictions, real):
-    differences = (predictions - real).numpy().reshape(len(real), -1)
-    return torch.from_numpy(np.linalg.norm(differences, axis=1) / math.sqrt(differences.shape[1])).to(real.dtype)
+def _numpy_errors(gaps):
+    differences = gaps.numpy().reshape(len(gaps), -1)
+    return torch.from_numpy(np.linalg.norm(differences, axis=1) / math.sqrt(differences.shape[1])).to(gaps.dtype)
 
 
 def _other_order(model, obs, actions, generator):
@@ -704,53 +653,51 @@ def _other_order(model, obs, actions, generator):
 
 _WRONG_MODEL_ERROR_BY_HORIZON = {
     "one-step-predictions": (
-        _error(_root_mean_square, lambda model, predicted, real, taken, generator: model(real, taken, generator)[0]),
+        _error(predict=lambda model, predicted, real, taken, generator: model(real, taken, generator)[0]),
         "Each prediction starts from the real observation, so errors never add up: go on from what the model predicted.",
     ),
     "mean-square": (
-        _error(lambda p, real: (p - real).square().mean((1, 2))),
+        _error(lambda gaps: gaps.square().mean((1, 2))),
         "This is the mean square error: take its root, which is in units of the observations.",
     ),
     "mean-of-distances": (
-        _error(lambda p, real: (p - real).square().sum(-1).sqrt().mean(1)),
+        _error(lambda gaps: gaps.square().sum(-1).sqrt().mean(1)),
         "This is the mean Euclidean distance: the mean over samples and components comes before the root.",
     ),
     "mean-of-roots": (
-        _error(lambda p, real: (p - real).square().mean(-1).sqrt().mean(1)),
+        _error(lambda gaps: gaps.square().mean(-1).sqrt().mean(1)),
         "The root is taken for each sample: the mean over samples and components comes before the root.",
     ),
     "absolute-error": (
-        _error(lambda p, real: (p - real).abs().mean((1, 2))),
+        _error(lambda gaps: gaps.abs().mean((1, 2))),
         "This is the mean absolute error: the root mean square is asked for.",
     ),
     "summed-over-components": (
-        _error(lambda p, real: (p - real).square().sum(-1).mean(1).sqrt()),
+        _error(lambda gaps: gaps.square().sum(-1).mean(1).sqrt()),
         "The squares are summed over the components: take their mean.",
     ),
     "error-of-the-mean": (
-        _error(lambda p, real: (p - real).mean(1).square().mean(-1).sqrt()),
+        _error(lambda gaps: gaps.mean(1).square().mean(-1).sqrt()),
         "Errors of opposite sign cancel: square before averaging over samples.",
     ),
     "per-component": (
-        _error(lambda p, real: (p - real).square().mean(1).sqrt()),
+        _error(lambda gaps: gaps.square().mean(1).sqrt()),
         "One number for each horizon is asked for: take the mean over components, too.",
     ),
     "accumulated": (
-        _error(lambda p, real: _root_mean_square(p, real).cumsum(0)),
+        _error(lambda gaps: _root_mean_square(gaps).cumsum(0)),
         "The errors of all horizons so far are added up: each horizon has its own.",
     ),
     "averaged-over-horizons": (
-        _error(lambda p, real: _root_mean_square(p, real).mean()),
+        _error(lambda gaps: _root_mean_square(gaps).mean()),
         "One number for each horizon is asked for: how the error grows is the point.",
     ),
     "start-included": (
-        _error(lambda p, real: torch.cat([torch.zeros_like(p[:1, 0, 0]), _root_mean_square(p, real)])),
+        _error(lambda gaps: torch.cat([torch.zeros_like(gaps[:1, 0, 0]), _root_mean_square(gaps)])),
         "The horizon begins at 1: the error at the start, 0, is left out.",
     ),
     "first-action-repeated": (
-        lambda model, obs, actions, generator: ch51.model_error_by_horizon(
-            model, obs, actions[:1].expand_as(actions) if len(obs) == len(actions) + 1 else actions, generator
-        ),
+        _error(act=lambda actions: actions[:1].expand_as(actions)),
         "The first action is used at every step: step h takes actions[h].",
     ),
 }
@@ -763,37 +710,29 @@ MODEL_ERROR_BY_HORIZON = Exercise(
     cases=drawn_once(
         Case("five steps", _trajectories(), visible=True, draws=2),
         Case("a noisy model", _trajectories(noise=0.5), visible=True),
-        Case(
-            "a perfect model",
-            _perfect,
-            closed_form=lambda actions, **_rest: torch.zeros(len(actions), dtype=actions.dtype),
-            visible=True,
-        ),
+        Case("a perfect model", _perfect, closed_form=lambda actions, **_rest: actions.new_zeros(len(actions)), visible=True),
         Case("one step", _trajectories(1), visible=True),
         Case("a single trajectory", _trajectories(batch=1)),
         Case("as many trajectories as steps", _trajectories(4, 4, 4)),
         Case("calls of the model", _trajectories(), returns=("model",)),
         Case("a model that believes in ends", _trajectories(limit=0.5)),
         Case("single precision", _trajectories(), dtype=torch.float32, visible=True),
-        Case("as many obs as actions", reshaped(_trajectories(), "obs", lambda x: x[:-1]), raises=_STEPS, visible=True),
-        Case("obs of one trajectory", reshaped(_trajectories(), "obs", lambda x: x[:, :1]), raises=_STEPS),
-        Case("obs a step too long", reshaped(_trajectories(), "obs", lambda x: torch.cat([x, x[-1:]])), raises=_STEPS),
+        misshapen("as many obs as actions", _trajectories(), "obs", lambda x: x[:-1], _STEPS, visible=True),
+        misshapen("obs of one trajectory", _trajectories(), "obs", lambda x: x[:, :1], _STEPS),
+        misshapen("obs a step too long", _trajectories(), "obs", lambda x: torch.cat([x, x[-1:]]), _STEPS),
     ),
     misconceptions=(
         *wrong(_WRONG_MODEL_ERROR_BY_HORIZON),
-        dtype_lost(ch51.model_error_by_horizon),
-        in_place(ch51.model_error_by_horizon, "obs", 1),
-        bad_input_accepted(_error(_root_mean_square, checked=False)),
+        *spoilt(ch51.model_error_by_horizon, dtype_lost, changed="obs"),
+        bad_input_accepted(_error(checked=False)),
     ),
     variants={
         "all predictions first": _forecast(_other_order),
-        "by indices": _error(_root_mean_square),
+        "by indices": _error(),
         "NumPy": _error(_numpy_errors),
-        "vector norm": _error(
-            lambda p, real: torch.linalg.vector_norm(p - real, dim=(1, 2)) / math.sqrt(p.shape[1] * p.shape[2])
-        ),
+        "vector norm": _error(lambda gaps: torch.linalg.vector_norm(gaps, dim=(1, 2)) / math.sqrt(gaps.shape[1] * gaps.shape[2])),
         "mean squared error, step by step": _error(
-            lambda p, real: torch.stack([functional.mse_loss(a, b).sqrt() for a, b in zip(p, real, strict=True)])
+            lambda gaps: torch.stack([F.mse_loss(gap, torch.zeros_like(gap)).sqrt() for gap in gaps])
         ),
     },
 )
@@ -840,6 +779,9 @@ def _predicted(
 
 def _biased(x):
     return _moments(x, lambda x: x.std(0, correction=0))
+
+
+_BIASED = _predicted(lambda inputs, seen: _biased(seen), lambda seen: _biased(seen["next_obs"] - seen["obs"]))
 
 
 def _observations_only(inputs, seen):
@@ -929,7 +871,7 @@ _WRONG_REPAIRED_NEXT_OBS = {
 REPAIRED_NEXT_OBS = Exercise(
     name="repaired_next_obs",
     reference=ch51.repaired_next_obs,
-    also_right=(_predicted(lambda inputs, seen: _biased(seen), lambda seen: _biased(seen["next_obs"] - seen["obs"])),),
+    also_right=(_BIASED,),
     criteria={"values": 1.7, "dtype": 0.1, "inputs": 0.1, "errors": 0.1},
     axes=("step", "component"),
     cases=(
@@ -938,17 +880,16 @@ REPAIRED_NEXT_OBS = Exercise(
         Case("a single state", _planned(1), visible=True),
         Case("more states than were seen", _planned(30, 12)),
         Case("single precision", _planned(), dtype=torch.float32, visible=True),
-        Case("actions of one step", reshaped(_planned(), "actions", lambda x: x[:1]), raises=_STEPS, visible=True),
-        Case("obs without the last", reshaped(_planned(), "obs", lambda x: x[:-1]), raises=_STEPS),
+        misshapen("actions of one step", _planned(), "actions", lambda x: x[:1], _STEPS, visible=True),
+        misshapen("obs without the last", _planned(), "obs", lambda x: x[:-1], _STEPS),
     ),
     misconceptions=(
         *wrong(_WRONG_REPAIRED_NEXT_OBS),
-        dtype_lost(ch51.repaired_next_obs),
-        in_place(ch51.repaired_next_obs, "obs", 1),
+        *spoilt(ch51.repaired_next_obs, dtype_lost, changed="obs"),
         bad_input_accepted(_predicted(checked=False)),
     ),
     variants={
-        "biased deviations": _predicted(lambda inputs, seen: _biased(seen), lambda seen: _biased(seen["next_obs"] - seen["obs"])),
+        "biased deviations": _BIASED,
         "moments passed along": _predicted(),
         "a row at a time, in NumPy": _next_obs(_row_at_a_time),
         "var_mean and addcmul": _next_obs(_among_the_seen),
