@@ -89,31 +89,25 @@ def _density(terms):
     return _densities(lambda m, s, a: terms((a - m) / s.exp(), s.expand(a.shape)))
 
 
-def _by_dimension(z, log_std):
+def _each(z, log_std):
     return -0.5 * z**2 - log_std - HALF_LOG_TWO_PI
 
 
 def _summed(z, log_std):
-    return _by_dimension(z, log_std).sum(-1)
+    return _each(z, log_std).sum(-1)
 
 
 _WRONG_TERMS = {
-    "not-summed": (
-        _by_dimension,
-        "One number for each sample, (B,): the dimensions are independent, so their log-densities add up.",
-    ),
+    "not-summed": (_each, "One number for each sample, (B,): the dimensions are independent, so their log-densities add up."),
     "averaged-over-dimensions": (
-        lambda z, s: _by_dimension(z, s).mean(-1),
+        lambda z, s: _each(z, s).mean(-1),
         "This is the mean over the action's dimensions. A joint density is a product: take the sum of the logarithms.",
     ),
     "summed-over-samples": (
-        lambda z, s: _by_dimension(z, s).sum(0),
+        lambda z, s: _each(z, s).sum(0),
         "Sum over the action's dimensions, the last axis, not over the samples.",
     ),
-    "summed-over-everything": (
-        lambda z, s: _by_dimension(z, s).sum(),
-        "One number for each sample, (B,): sum over the last axis only.",
-    ),
+    "summed-over-everything": (lambda z, s: _each(z, s).sum(), "One number for each sample, (B,): sum over the last axis only."),
     "half-missing": (
         lambda z, s: (-(z**2) - s - HALF_LOG_TWO_PI).sum(-1),
         "The exponent of the normal density is -z² / 2: the half is missing.",
@@ -208,7 +202,7 @@ GAUSSIAN_LOG_PROB = Exercise(
     variants={
         "torch.distributions": _densities(lambda m, s, a: Independent(Normal(m, s.exp()), 1).log_prob(a)),
         "torch.distributions, summed": _densities(lambda m, s, a: Normal(m, torch.exp(s)).log_prob(a).sum(dim=1)),
-        "one dimension after the other": _density(lambda z, s: sum(map(_by_dimension, z.unbind(1), s.unbind(1)))),
+        "one dimension after the other": _density(lambda z, s: sum(map(_each, z.unbind(1), s.unbind(1)))),
         "variance and its logarithm": _densities(
             lambda m, s, a: -0.5 * ((a - m).square() / (2 * s).exp() + 2 * s + math.log(2 * math.pi)).sum(-1)
         ),

@@ -674,10 +674,7 @@ _WRONG_STEPS = {
         lambda target, online, tau: target.sub_(tau * (online - target)),
         "The targets move away from the online parameters: the difference has the wrong sign.",
     ),
-    "shrunk": (
-        lambda target, online, tau: target.mul_(1 - tau),
-        "The online parameters' share is missing: add tau times theirs.",
-    ),
+    "shrunk": (lambda target, _, tau: target.mul_(1 - tau), "The online parameters' share is missing: add tau times theirs."),
     "weights-in-sequence": (
         lambda target, online, tau: target.add_(tau * online).mul_(1 - tau),
         "The online share is shrunk by 1 - tau as well: multiply the targets first, then add.",

@@ -509,10 +509,7 @@ _WRONG_DREAMER_LAMBDA_RETURNS = {
         _backwards(c=lambda c: torch.cat([c[1:], torch.ones_like(c[:1])])),
         "continues[t] belongs to step t: here that of step t + 1 is used.",
     ),
-    "end-taken-as-flag": (
-        _backwards(c=lambda c: (c > 0.5).to(c.dtype)),
-        "continues may be a probability: multiply by it, do not round it.",
-    ),
+    "end-taken-as-flag": (_backwards(c=torch.round), "continues may be a probability: multiply by it, do not round it."),
     "gamma-missing": (
         _backwards(lambda r, v, c, f, gamma, lam: _right(r, v, c, f, 1.0, lam)),
         "What follows is not discounted: multiply it by gamma.",
@@ -651,50 +648,50 @@ def _other_order(model, obs, actions, generator):
     return (gaps**2).flatten(1).sum(1).div(gaps[0].numel()).pow(0.5)
 
 
+_WRONG_MEASURES = {
+    "mean-square": (
+        lambda gap: gap.square().mean((1, 2)),
+        "This is the mean square error: take its root, which is in units of the observations.",
+    ),
+    "mean-of-distances": (
+        lambda gap: gap.square().sum(-1).sqrt().mean(1),
+        "This is the mean Euclidean distance: the mean over samples and components comes before the root.",
+    ),
+    "mean-of-roots": (
+        lambda gap: gap.square().mean(-1).sqrt().mean(1),
+        "The root is taken for each sample: the mean over samples and components comes before the root.",
+    ),
+    "absolute-error": (lambda gap: gap.abs().mean((1, 2)), "This is the mean absolute error: the root mean square is asked for."),
+    "summed-over-components": (
+        lambda gap: gap.square().sum(-1).mean(1).sqrt(),
+        "The squares are summed over the components: take their mean.",
+    ),
+    "error-of-the-mean": (
+        lambda gap: gap.mean(1).square().mean(-1).sqrt(),
+        "Errors of opposite sign cancel: square before averaging over samples.",
+    ),
+    "per-component": (
+        lambda gap: gap.square().mean(1).sqrt(),
+        "One number for each horizon is asked for: take the mean over components, too.",
+    ),
+    "accumulated": (
+        lambda gap: _root_mean_square(gap).cumsum(0),
+        "The errors of all horizons so far are added up: each horizon has its own.",
+    ),
+    "averaged-over-horizons": (
+        lambda gap: _root_mean_square(gap).mean(),
+        "One number for each horizon is asked for: how the error grows is the point.",
+    ),
+    "start-included": (
+        lambda gap: torch.cat([torch.zeros_like(gap[:1, 0, 0]), _root_mean_square(gap)]),
+        "The horizon begins at 1: the error at the start, 0, is left out.",
+    ),
+}
+
 _WRONG_MODEL_ERROR_BY_HORIZON = {
     "one-step-predictions": (
         _error(predict=lambda model, predicted, real, taken, generator: model(real, taken, generator)[0]),
         "Each prediction starts from the real observation, so errors never add up: go on from what the model predicted.",
-    ),
-    "mean-square": (
-        _error(lambda gaps: gaps.square().mean((1, 2))),
-        "This is the mean square error: take its root, which is in units of the observations.",
-    ),
-    "mean-of-distances": (
-        _error(lambda gaps: gaps.square().sum(-1).sqrt().mean(1)),
-        "This is the mean Euclidean distance: the mean over samples and components comes before the root.",
-    ),
-    "mean-of-roots": (
-        _error(lambda gaps: gaps.square().mean(-1).sqrt().mean(1)),
-        "The root is taken for each sample: the mean over samples and components comes before the root.",
-    ),
-    "absolute-error": (
-        _error(lambda gaps: gaps.abs().mean((1, 2))),
-        "This is the mean absolute error: the root mean square is asked for.",
-    ),
-    "summed-over-components": (
-        _error(lambda gaps: gaps.square().sum(-1).mean(1).sqrt()),
-        "The squares are summed over the components: take their mean.",
-    ),
-    "error-of-the-mean": (
-        _error(lambda gaps: gaps.mean(1).square().mean(-1).sqrt()),
-        "Errors of opposite sign cancel: square before averaging over samples.",
-    ),
-    "per-component": (
-        _error(lambda gaps: gaps.square().mean(1).sqrt()),
-        "One number for each horizon is asked for: take the mean over components, too.",
-    ),
-    "accumulated": (
-        _error(lambda gaps: _root_mean_square(gaps).cumsum(0)),
-        "The errors of all horizons so far are added up: each horizon has its own.",
-    ),
-    "averaged-over-horizons": (
-        _error(lambda gaps: _root_mean_square(gaps).mean()),
-        "One number for each horizon is asked for: how the error grows is the point.",
-    ),
-    "start-included": (
-        _error(lambda gaps: torch.cat([torch.zeros_like(gaps[:1, 0, 0]), _root_mean_square(gaps)])),
-        "The horizon begins at 1: the error at the start, 0, is left out.",
     ),
     "first-action-repeated": (
         _error(act=lambda actions: actions[:1].expand_as(actions)),
@@ -722,6 +719,7 @@ MODEL_ERROR_BY_HORIZON = Exercise(
         misshapen("obs a step too long", _trajectories(), "obs", lambda x: torch.cat([x, x[-1:]]), _STEPS),
     ),
     misconceptions=(
+        *wrong(_WRONG_MEASURES, _error),
         *wrong(_WRONG_MODEL_ERROR_BY_HORIZON),
         *spoilt(ch51.model_error_by_horizon, dtype_lost, changed="obs"),
         bad_input_accepted(_error(checked=False)),
