@@ -361,8 +361,7 @@ _WRONG_ORDERS = {
     ),
     "generator-not-used": (
         lambda size, _: torch.randperm(size),
-        "The order is random but not drawn from the given generator, so that nobody can repeat your run: "
-        "torch.randperm takes generator=….",
+        "The order is random but not drawn from the given generator, so that nobody can repeat your run: torch.randperm takes generator=….",
     ),
 }
 
@@ -975,17 +974,21 @@ def _minibatches_of(batch, settings, generator):
     return [batch[indices] for indices in ch45.minibatches(len(batch), settings.minibatch_size, generator)]
 
 
-def _coefficients(settings):
-    return settings.clip_range, settings.vf_coef, settings.ent_coef
-
-
 def _averaged(history):
     return {name: torch.stack([metrics[name] for metrics in history]).mean() for name in history[0]}
 
 
-def _loss(policy, rows, coefficients, old=lambda rows, _log_probs: rows.old_log_probs, weights=lambda rows: rows.advantages):
+def _loss(
+    policy,
+    rows,
+    settings,
+    old=lambda rows, _log_probs: rows.old_log_probs,
+    weights=lambda rows: rows.advantages,
+    coefficients=lambda settings: (settings.clip_range, settings.vf_coef, settings.ent_coef),
+):
     log_probs, entropy, values = ch45.evaluate_actions(policy, rows.obs, rows.actions)
-    return ch45.ppo_loss(log_probs, old(rows, log_probs), weights(rows), values, rows.returns, entropy, *coefficients)
+    given = (log_probs, old(rows, log_probs), weights(rows), values, rows.returns, entropy)
+    return ch45.ppo_loss(*given, *coefficients(settings))
 
 
 def _afresh(policy, loss):
@@ -1005,31 +1008,29 @@ def _from_zero(policy, loss):
 
 
 def _updating(
-    epochs=lambda settings: settings.num_epochs,
     parts=_minibatches_of,
-    coefficients=_coefficients,
+    of_loss=None,
     differentiate=_afresh,
-    longest=lambda settings: settings.max_grad_norm,
-    stop_at="epoch",
+    in_the_midst=False,
     summary=_averaged,
     trained=lambda policy: policy,
-    **of_loss,
+    **fixed,
 ):
-    """A version of the program, from the places where it can go wrong; it stops at the end of an epoch, in its midst, or never."""
+    """A version of the program, from the places where it can go wrong; `fixed` are settings of its own, whatever the caller's are."""
 
     def version(policy, optimizer, batch, settings, generator):
-        policy, history = trained(policy), []
-        for _ in range(epochs(settings)):
+        policy, settings, history = trained(policy), replace(settings, **fixed), []
+        for _ in range(settings.num_epochs):
             divergences = []
             for rows in parts(batch, settings, generator):
-                loss, metrics = _loss(policy, rows, coefficients(settings), **of_loss)
+                loss, metrics = _loss(policy, rows, settings, **(of_loss or {}))
                 differentiate(policy, loss)
-                optimizer.step(policy, longest(settings))
+                optimizer.step(policy, settings.max_grad_norm)
                 history.append(metrics)
                 divergences.append(metrics["approx_kl"].item())
-                if stop_at == "minibatch" and divergences[-1] > settings.target_kl:
+                if in_the_midst and divergences[-1] > settings.target_kl:
                     return summary(history)
-            if stop_at == "epoch" and sum(divergences) / len(divergences) > settings.target_kl:
+            if sum(divergences) / len(divergences) > settings.target_kl:
                 break
         return summary(history)
 
@@ -1043,7 +1044,7 @@ def _running_sums(policy, optimizer, batch, settings, generator):
     while epoch < settings.num_epochs and divergence <= settings.target_kl:
         order, start, divergence = torch.randperm(len(batch.obs), generator=generator), 0, 0.0
         while start < len(order):
-            loss, metrics = _loss(policy, batch[order[start : start + settings.minibatch_size]], _coefficients(settings))
+            loss, metrics = _loss(policy, batch[order[start : start + settings.minibatch_size]], settings)
             loss.backward()
             optimizer.step(policy, settings.max_grad_norm)
             policy.weights.grad.zero_()
@@ -1064,10 +1065,10 @@ _WRONG_PPO_UPDATE = {
         "backward() adds to the gradient that is there: set policy.weights.grad to None before it.",
     ),
     "gradient-not-clipped": (
-        _updating(longest=lambda settings: INF),
+        _updating(max_grad_norm=INF),
         "The gradient's norm is not clipped: hand settings.max_grad_norm to optimizer.step.",
     ),
-    "one-epoch-only": (_updating(epochs=lambda settings: 1), "The batch is used once: settings.num_epochs says how often."),
+    "one-epoch-only": (_updating(num_epochs=1), "The batch is used once: settings.num_epochs says how often."),
     "whole-batch-at-once": (
         _updating(parts=lambda batch, settings, generator: [batch]),
         "There is one step in each epoch: make one for each minibatch.",
@@ -1077,27 +1078,24 @@ _WRONG_PPO_UPDATE = {
         "Each epoch ends after its first minibatch: a return or break is one level too deep.",
     ),
     "old-log-probs-recomputed": (
-        _updating(old=lambda rows, log_probs: log_probs.detach()),
+        _updating(of_loss={"old": lambda rows, log_probs: log_probs.detach()}),
         "The old log-probabilities are those of the policy that acted, batch.old_log_probs, in every epoch.",
     ),
     "advantages-normalised-again": (
-        _updating(weights=lambda rows: normalised(rows.advantages)),
+        _updating(of_loss={"weights": lambda rows: normalised(rows.advantages)}),
         "The advantages are normalised here, although they are to be taken as given: whoever made the batch has decided.",
     ),
-    "clip-range-fixed": (
-        _updating(coefficients=lambda settings: (0.2, settings.vf_coef, settings.ent_coef)),
-        "The clip range is 0.2 whatever the settings say.",
-    ),
+    "clip-range-fixed": (_updating(clip_range=0.2), "The clip range is 0.2 whatever the settings say."),
     "coefficients-swapped": (
-        _updating(coefficients=lambda settings: (settings.clip_range, settings.ent_coef, settings.vf_coef)),
+        _updating(of_loss={"coefficients": lambda given: (given.clip_range, given.ent_coef, given.vf_coef)}),
         "vf_coef and ent_coef are the wrong way round in the call of ppo_loss.",
     ),
     "target-kl-ignored": (
-        _updating(stop_at="never"),
+        _updating(target_kl=INF),
         "The update goes on although the KL divergence has passed settings.target_kl: stop after that epoch.",
     ),
     "stops-in-the-midst": (
-        _updating(stop_at="minibatch"),
+        _updating(in_the_midst=True),
         "The update stops in the midst of an epoch: a single minibatch's KL is noisy, compare the epoch's mean.",
     ),
     "metrics-of-the-last-minibatch": (
