@@ -70,12 +70,9 @@ def _mode_density(mean, log_std, actions):
 
 def _density_by_hand(mean, log_std, actions):
     """One number at a time, by Python's floats."""
-    rows = log_std.expand_as(mean).tolist()
-    sums = []
-    for centres, logs, taken in zip(mean.tolist(), rows, actions.tolist(), strict=True):
-        pieces = zip(centres, logs, taken, strict=True)
-        sums.append(sum(-0.5 * ((a - m) / math.exp(s)) ** 2 - s - HALF_LOG_TWO_PI for m, s, a in pieces))
-    return torch.tensor(sums, dtype=mean.dtype)
+    numbers = zip(*(x.flatten().tolist() for x in (mean, log_std.expand_as(mean), actions)), strict=True)
+    terms = [-0.5 * ((a - m) / math.exp(s)) ** 2 - s - HALF_LOG_TWO_PI for m, s, a in numbers]
+    return torch.tensor(terms, dtype=mean.dtype).view_as(mean).sum(-1)
 
 
 _PAIR = ("mean", "actions")

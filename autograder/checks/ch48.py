@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +19,7 @@ from autograder.authoring.parts import (
     dtype_lost,
     in_place,
     normal,
+    number,
     one_shape,
     python_float,
     refused,
@@ -70,14 +70,11 @@ def _at_rest(generator):
 
 def _by_hyperbolic_cosine(mean, log_std, pre_tanh_actions):
     """One number at a time: 1 - tanh² u = 1 / cosh² u."""
-    sums = []
-    for row in zip(mean.tolist(), log_std.tolist(), pre_tanh_actions.tolist(), strict=True):
-        total = 0.0
-        for m, s, u in zip(*row, strict=True):
-            log_cosh = abs(u) + math.log1p(math.exp(-2 * abs(u))) - math.log(2)
-            total += -0.5 * ((u - m) / math.exp(s)) ** 2 - s - HALF_LOG_TWO_PI + 2 * log_cosh
-        sums.append(total)
-    return torch.tensor(sums, dtype=mean.dtype)
+    terms = []
+    for m, s, u in zip(*(x.flatten().tolist() for x in (mean, log_std, pre_tanh_actions)), strict=True):
+        log_cosh = abs(u) + math.log1p(math.exp(-2 * abs(u))) - math.log(2)
+        terms.append(-0.5 * ((u - m) / math.exp(s)) ** 2 - s - HALF_LOG_TWO_PI + 2 * log_cosh)
+    return torch.tensor(terms, dtype=mean.dtype).view_as(mean).sum(-1)
 
 
 def _normal(m, s, u):
@@ -258,6 +255,11 @@ def _soft(r, c, q1, q2, lp, alpha, gamma):
     return r + gamma * c * (torch.minimum(q1, q2) - alpha * lp)
 
 
+def _fixed(**fixed):
+    """A version in which some terms of the target are these, whatever the caller says."""
+    return lambda *terms: _soft(**(dict(zip(("r", "c", "q1", "q2", "lp", "alpha", "gamma"), terms, strict=True)) | fixed))
+
+
 def _worth(value):
     """A version: `value` of what follows, from both critics and the entropy's worth h."""
     return _target(lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * value(q1, q2, -alpha * lp))
@@ -291,10 +293,7 @@ _WRONG_VALUES = {
 }
 
 _WRONG_SOFT_Q_TARGET = {
-    "alpha-missing": (
-        lambda r, c, q1, q2, lp, alpha, gamma: _soft(r, c, q1, q2, lp, 1.0, gamma),
-        "alpha is not used: it is the price of a nat of entropy in units of reward.",
-    ),
+    "alpha-missing": (_fixed(alpha=1.0), "alpha is not used: it is the price of a nat of entropy in units of reward."),
     "entropy-of-the-end": (
         lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * (c * torch.minimum(q1, q2) - alpha * lp),
         "The entropy term is left standing where the task has ended: after the end no action is taken, and none is random.",
@@ -303,10 +302,7 @@ _WRONG_SOFT_Q_TARGET = {
         lambda r, c, q1, q2, lp, alpha, gamma: r + c * (gamma * torch.minimum(q1, q2) - alpha * lp),
         "The entropy is that of the next action, one step away: it is discounted as the value is.",
     ),
-    "end-ignored": (
-        lambda r, c, q1, q2, lp, alpha, gamma: _soft(r, 1.0, q1, q2, lp, alpha, gamma),
-        "terminated is not used: nothing follows where the task has ended.",
-    ),
+    "end-ignored": (_fixed(c=1.0), "terminated is not used: nothing follows where the task has ended."),
     "end-inverted": (
         lambda r, c, q1, q2, lp, alpha, gamma: _soft(r, 1 - c, q1, q2, lp, alpha, gamma),
         "The bootstrap is kept where the task has ended and dropped where it goes on: multiply by 1 - terminated.",
@@ -315,10 +311,7 @@ _WRONG_SOFT_Q_TARGET = {
         lambda r, c, q1, q2, lp, alpha, gamma: _soft(r, c, q1, q2, lp, alpha, gamma) * c,
         "The last reward is paid, too: only what follows it falls away.",
     ),
-    "gamma-missing": (
-        lambda r, c, q1, q2, lp, alpha, gamma: _soft(r, c, q1, q2, lp, alpha, 1.0),
-        "What follows is not discounted: multiply it by gamma.",
-    ),
+    "gamma-missing": (_fixed(gamma=1.0), "What follows is not discounted: multiply it by gamma."),
     "gamma-on-the-reward": (
         lambda r, c, q1, q2, lp, alpha, gamma: gamma * _soft(r, c, q1, q2, lp, alpha, 1.0),
         "The reward of this step is not discounted: gamma belongs to what follows.",
@@ -333,12 +326,7 @@ SOFT_Q_TARGET = Exercise(
     cases=drawn_once(
         Case("eight steps", _steps(), closed_form=_target_by_steps, visible=True, draws=2),
         Case("default gamma", without(_steps(), "gamma"), closed_form=_target_by_steps, visible=True),
-        Case(
-            "all steps terminate: the reward",
-            _steps(ends=True),
-            closed_form=lambda rewards, **_rest: rewards.clone(),
-            visible=True,
-        ),
+        Case("all steps terminate: the reward", _steps(ends=True), closed_form=lambda rewards, **_rest: rewards, visible=True),
         Case("no step terminates", _steps(ends=False), closed_form=_target_by_steps),
         Case("alpha = 0: a plain target", _steps(alpha=0.0), closed_form=_target_by_steps, visible=True),
         Case("gamma = 1", _steps(gamma=1.0), closed_form=_target_by_steps),
@@ -563,12 +551,7 @@ TEMPERATURE_LOSS = Exercise(
     criteria={"values": 0.7, "gradient": 0.2, "dtype": 0.05, "inputs": 0.05},
     cases=drawn_once(
         Case("nine samples", _temperature(), closed_form=_temperature_by_hand, visible=True, draws=2),
-        Case(
-            "on target: nothing to change",
-            _on_target,
-            closed_form=lambda log_probs, **_rest: torch.zeros((), dtype=log_probs.dtype),
-            visible=True,
-        ),
+        Case("on target: nothing to change", _on_target, closed_form=number(0.0), visible=True),
         Case("a single sample", _temperature(1), closed_form=_temperature_by_hand, visible=True),
         Case("a positive target", _temperature(target_entropy=0.5), closed_form=_temperature_by_hand),
         Case("a high temperature", _temperature(log_alpha=2.0), closed_form=_temperature_by_hand),
@@ -898,7 +881,6 @@ INTERQUARTILE_MEAN = Exercise(
 HALVES = (0, 0, 0, 0, 1, 1, 1, 1)
 FEW = (0, 0, 1, 1)
 LUCKY = (0, 0, 0, 1)
-_SPARE: dict[str, Any] = {"rtol": 1e-4, "atol": 1e-4}
 
 
 @drawing
@@ -922,6 +904,11 @@ def _together(generator):
     drawn = _pattern(FEW)(generator)
     first = drawn["scores"]
     return drawn | {"scores": torch.stack([first, first.max() + first.min() - first], 1)}
+
+
+def _ends(name, inputs, **options):
+    """A case in which the interval's ends are looked at."""
+    return Case(name, inputs, rtol=1e-4, atol=1e-4, **options)
 
 
 def _certain(scores, **_rest):
@@ -1079,24 +1066,20 @@ BOOTSTRAP_INTERVAL = Exercise(
     reference=ch48.bootstrap_interval,
     criteria={"values": 1.3, "dtype": 0.1, "inputs": 0.1},
     cases=drawn_once(
-        Case("eight seeds, half of them failed", _pattern(HALVES), visible=True, **_SPARE),
-        Case("four seeds, one of them lucky", _pattern(LUCKY, confidence=0.7), visible=True, **_SPARE),
-        Case("confidence 0.9", _pattern(HALVES, confidence=0.9, num_resamples=1000), **_SPARE),
-        Case("two tasks", _pattern(FEW, [score + 10 for score in FEW], confidence=0.7), visible=True, **_SPARE),
-        Case("two tasks in which seeds trade places", _together, visible=True, draws=2, **_SPARE),
-        Case(
-            "three tasks, all seeds alike: no width",
-            _pattern((0,) * 6, (1,) * 6, (5,) * 6),
-            closed_form=_certain,
-            visible=True,
-            **_SPARE,
+        _ends("eight seeds, half of them failed", _pattern(HALVES), visible=True),
+        _ends("four seeds, one of them lucky", _pattern(LUCKY, confidence=0.7), visible=True),
+        _ends("confidence 0.9", _pattern(HALVES, confidence=0.9, num_resamples=1000)),
+        _ends("two tasks", _pattern(FEW, [score + 10 for score in FEW], confidence=0.7), visible=True),
+        _ends("two tasks in which seeds trade places", _together, visible=True, draws=2),
+        _ends(
+            "three tasks, all seeds alike: no width", _pattern(*((x,) * 6 for x in (0, 1, 5))), closed_form=_certain, visible=True
         ),
-        Case("a single seed: no width", _pattern((3,)), closed_form=_certain, **_SPARE),
-        Case("default settings", without(_pattern(HALVES), "confidence", "num_resamples"), visible=True, **_SPARE),
-        Case("no generator", replaced(_pattern(HALVES), generator=None), **_SPARE),
-        Case("a single resample: no width", _pattern(HALVES, num_resamples=1), view="width", visible=True, **_SPARE),
+        _ends("a single seed: no width", _pattern((3,)), closed_form=_certain),
+        _ends("default settings", without(_pattern(HALVES), "confidence", "num_resamples"), visible=True),
+        _ends("no generator", replaced(_pattern(HALVES), generator=None)),
+        _ends("a single resample: no width", _pattern(HALVES, num_resamples=1), view="width", visible=True),
         Case("what is drawn from", _pattern(HALVES, num_resamples=20), returns=("generator",), view="drawn_from", visible=True),
-        Case("single precision", _pattern(HALVES), dtype=torch.float32, visible=True, **_SPARE),
+        _ends("single precision", _pattern(HALVES), dtype=torch.float32, visible=True),
     ),
     misconceptions=(*wrong(_WRONG_BOOTSTRAP_INTERVAL), in_place(ch48.bootstrap_interval, "scores")),
     variants={

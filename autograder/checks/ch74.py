@@ -650,11 +650,9 @@ _gaussian = versions_of(
 
 def _gaussian_by_hand(mean, log_std, expert_actions):
     total = 0.0
-    for m, s, a in zip(mean.tolist(), log_std.expand_as(mean).tolist(), expert_actions.tolist(), strict=True):
-        for mu, log_sigma, action in zip(m, s, a, strict=True):
-            sigma = math.exp(log_sigma)
-            density = math.exp(-((action - mu) ** 2) / (2 * sigma**2)) / (sigma * math.sqrt(2 * math.pi))
-            total -= math.log(density)
+    for m, s, a in zip(*(x.flatten().tolist() for x in (mean, log_std.expand_as(mean), expert_actions)), strict=True):
+        density = math.exp(-((a - m) ** 2) / (2 * math.exp(2 * s))) / (math.exp(s) * math.sqrt(2 * math.pi))
+        total -= math.log(density)
     return torch.tensor(total / len(mean), dtype=torch.float64)
 
 
@@ -913,6 +911,7 @@ _WRONG_TRAIN_BC = {
     ),
 }
 
+_ROWS = ("obs", "actions")
 _TRAINED: dict[str, Any] = {"returns": ("network",)}  # it is looked at after the call
 _FITTED: dict[str, Any] = _TRAINED | {"closed_form": _least_squares}
 
@@ -934,7 +933,7 @@ TRAIN_BC = Exercise(
             visible=True,
         ),
         Case("num_steps = 0", _regression(num_steps=0), raises=["num_steps"]),
-        misshapen("actions with a row too few", _regression(), "actions", lambda x: x[:-1], ["obs", "actions"], visible=True),
+        misshapen("actions with a row too few", _regression(num_steps=2), "actions", lambda x: x[:-1], _ROWS, visible=True),
     ),
     misconceptions=(
         *wrong(_WRONG_TRAIN_BC),
@@ -974,14 +973,12 @@ def _summed_afterwards(policy, env, num_episodes, seed):
 def _in_a_buffer(policy, env, num_episodes, seed):
     returns = torch.zeros(num_episodes)
     for k in range(num_episodes):
-        obs, _ = env.reset(seed=seed + k)
-        while True:
+        obs, ends = env.reset(seed=seed + k)[0], [False]
+        while not any(ends):
             with torch.inference_mode():
                 action = policy(torch.from_numpy(obs).unsqueeze(0))[0]
-            obs, reward, terminated, truncated, _ = env.step(action.numpy())
+            obs, reward, *ends, _ = env.step(action.numpy())
             returns[k] += reward
-            if terminated or truncated:
-                break
     return returns
 
 
