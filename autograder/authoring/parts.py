@@ -196,7 +196,8 @@ def in_place(function: Callable, name: str, position: int = 0) -> Misconception:
     def wrong(*args, **kwargs):
         result = function(*args, **kwargs)
         with torch.no_grad():
-            (args[position] if position < len(args) else kwargs[name]).mul_(0.5)
+            given = args[position] if position < len(args) else kwargs[name]
+            given.mul_(0.5) if given.is_floating_point() else given.bitwise_not_()
         return result
 
     return Misconception("input-changed", wrong, IN_PLACE)

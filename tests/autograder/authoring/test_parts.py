@@ -90,3 +90,10 @@ def test_a_misshapen_argument_is_to_be_refused_by_its_name_unless_others_are_giv
     assert (drawn["x"].shape, drawn["y"].shape) == ((3,), (3, 1))
     assert (case.name, case.raises, case.facet, case.visible, case.draws) == ("y as a column", ["y"], "errors", True, 1)
     assert parts.misshapen("y as a column", inputs, "y", lambda y: y[:, None], ("x", "y")).raises == ("x", "y")
+
+
+def test_an_argument_of_any_kind_can_be_changed_in_place():
+    for given in (torch.ones(2), torch.ones(2, dtype=torch.int64), torch.ones(2, dtype=torch.bool)):
+        before = given.clone()
+        parts.in_place(lambda x: x.sum(), "x").function(given)
+        assert not torch.equal(given, before)
