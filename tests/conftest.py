@@ -16,6 +16,9 @@ from tests.groups import group_of, is_about, weight
 os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 
 os.environ.setdefault("COURSE_SEED", f"{date.today():%Y%m%d}")  # before xdist starts its workers, which inherit it
+# As in the kernels of pages: with as many threads as cores, workers side by side wait for one another at each small tensor.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+sys.modules.setdefault("rfc3987_syntax", None)  # type: ignore[arg-type]  # as in autograder.cli
 
 
 def pytest_addoption(parser):

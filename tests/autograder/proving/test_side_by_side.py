@@ -20,7 +20,8 @@ def test_alone_it_runs_here_and_an_error_costs_its_own_item_only():
     assert str(done[1].error) == "3 is odd"
 
 
-def test_side_by_side_it_runs_in_other_processes_with_one_thread():
+def test_side_by_side_it_runs_in_other_processes_with_one_thread(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
     done = {one.item: one for one in side_by_side.run(halved, [4, 3, 2], jobs=2)}
     assert str(done[3].error) == "3 is odd"
     assert [done[item].result[0] for item in (4, 2)] == [2, 1]

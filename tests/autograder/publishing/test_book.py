@@ -160,6 +160,7 @@ def test_a_picture_without_words_ends_the_run_at_its_cell(tmp_path, monkeypatch)
 
 
 def test_outputs_are_those_of_each_code_cell_and_come_from_the_cache_the_second_time(tmp_path, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
     chapter = chapter_with(tmp_path, monkeypatch, "import os\nprint(os.environ['COURSE_BOOK'], os.environ['OMP_NUM_THREADS'])")
     [[output]] = execution.executed_outputs(chapter)
     assert output.text == "1 1\n"
