@@ -40,8 +40,9 @@ check: install
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/python tools/format-chapters --check
-	$(BIN)/mypy
-	$(BIN)/python -m pytest -q $(IN_GROUPS) $(QUICK)
+	$(BIN)/mypy & types=$$!; \
+	$(BIN)/python -m pytest -q $(IN_GROUPS) $(QUICK); tests=$$?; \
+	wait $$types || { echo "mypy found what stands above, among the tests"; exit 1; }; exit $$tests
 
 bench: install
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[bench]'
