@@ -2,8 +2,8 @@
 
 Contract of the four steps:
   execute   every chapter's code runs once, the chapters side by side (autograder.publishing.execution keeps the outputs);
-  stage     all that Sphinx reads is computed in memory and written to book/_stage, where files that did not change keep
-            their time, so that Sphinx renders changed pages only;
+  stage     all that Sphinx reads is computed in memory, as far as it is not kept from before, and written to book/_stage, where
+            files that did not change keep their time, so that Sphinx renders changed pages only;
   render    Jupyter Book runs under _config.yml with warnings as errors, in book/_cache, never in the published tree;
   publish   the pages and what they refer to, nothing else, replace book/_build/html in one rename.
 A book with and one without solutions are staged and rendered in folders of their own, so that neither can leak into the other.
@@ -12,6 +12,8 @@ A book with and one without solutions are staged and rendered in folders of thei
 from __future__ import annotations
 
 import fnmatch
+import functools
+import hashlib
 import importlib.util
 import json
 import os
@@ -19,6 +21,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,9 +30,19 @@ import yaml
 
 from autograder.authoring import assemble
 from autograder.authoring.chapter import Chapter, all_chapters
-from autograder.paths import ROOT
+from autograder.paths import BIBLIOGRAPHY, ROOT, RUNS
+from autograder.proving.dependencies import PACKAGES
 from autograder.proving.locks import one_at_a_time
-from autograder.publishing.execution import BookError, cache_folder, content_hash, executed_outputs, execution_key, run_all
+from autograder.publishing.execution import (
+    BookError,
+    cache_folder,
+    cached,
+    content_hash,
+    executed_outputs,
+    execution_key,
+    keep_cached,
+    run_all,
+)
 from autograder.publishing.format_page import format_page
 from autograder.publishing.located import relocated
 
@@ -40,8 +53,9 @@ BOOK = ROOT / "book"
 STAGE = BOOK / "_stage"
 PUBLISHED = ("*.html", "searchindex.js", "_static/*", "_images/*", "_downloads/*")
 JUPYTER_BOOK = """
-import json, sys
+import functools, importlib.metadata, json, sys
 sys.modules["rfc3987_syntax"] = None  # as in autograder.cli
+importlib.metadata.entry_points = functools.cache(importlib.metadata.entry_points)  # for each reference, all packages are looked through
 import jupyter_book.sphinx, myst_nb.sphinx_ext, sphinx_book_theme, sphinxcontrib.bibtex
 from jupyter_book.cli.main import main
 main(json.loads(sys.stdin.read()))
@@ -70,7 +84,8 @@ def build(with_solutions: bool = True, out: Path | None = None) -> Path:
         stage, work = STAGE / variant, cache_folder() / f"sphinx-{variant}"
         with Renderer() as renderer:
             run_all(chapters, first=lambda: _verify_all(chapters))
-            if sync(staged_files(chapters, with_solutions), stage):
+            files = staged_files(chapters, with_solutions)
+            if sync(files, stage) | _is_framed_anew(files, work):
                 shutil.rmtree(work, ignore_errors=True)  # Sphinx never deletes the page of a source that has gone
             renderer.render(stage, work, chapters)
         publish(work / "_build" / "html", out)
@@ -89,22 +104,71 @@ def _verify_all(chapters: list[Chapter]) -> None:
 
 def staged_files(chapters: list[Chapter], with_solutions: bool) -> dict[str, bytes]:
     """Everything that Sphinx reads, by path relative to the staging folder."""
-    from autograder.proving import kept
-
     pages = [*BOOK.glob("*.md"), *BOOK.glob("how-to/*.md"), *BOOK.glob("*.bib")]
     files = {path.relative_to(BOOK).as_posix(): path.read_bytes() for path in pages}
     files["index.md"] = _front_page(files["index.md"].decode(), chapters).encode()
     files["notation.md"] = notation_page(yaml.safe_load((BOOK / "notation.yml").read_text(encoding="utf-8"))).encode()
     files["format.md"] = format_page().encode()
     files["_toc.yml"] = yaml.safe_dump(table_of_contents(chapters), sort_keys=False, allow_unicode=True).encode()
+    keys = _stage_keys(chapters, with_solutions)
     for chapter in chapters:
-        files |= staged_chapter(chapter, executed_outputs(chapter), with_solutions)
-    keys = kept.Keys()
-    matrix = {
-        f"{chapter.number}. {chapter.title}": kill_rows(chapter, keys) for chapter in chapters
-    }  # recorded, never drawn here
-    files["kill-matrix.md"] = kill_matrix_page(matrix).encode()
+        name = f"staged-{chapter.assignment}-{'solved' if with_solutions else 'unsolved'}"
+        files |= _kept(name, keys[chapter.assignment], functools.partial(_staged, chapter, with_solutions))
+    files |= _kept("staged-kill-matrix", keys["kill-matrix"], functools.partial(_staged_kill_matrix, chapters))
     return files | assets()
+
+
+def _staged(chapter: Chapter, with_solutions: bool) -> tuple[dict[str, bytes], bool]:
+    return staged_chapter(chapter, executed_outputs(chapter), with_solutions), True
+
+
+def _staged_kill_matrix(chapters: list[Chapter]) -> tuple[dict[str, bytes], bool]:
+    """From the records, as nothing is drawn here. Not to be kept where one is missing, for each build must say so."""
+    from autograder.proving import kept  # loads torch, as the checks themselves do
+
+    keys = kept.Keys()
+    matrix = {f"{chapter.number}. {chapter.title}": kill_rows(chapter, keys) for chapter in chapters}
+    proved = not any("unproved" in row for rows in matrix.values() for row in rows)
+    return {"kill-matrix.md": kill_matrix_page(matrix).encode()}, proved
+
+
+def _kept(name: str, key: str, make: Callable[[], tuple[dict[str, bytes], bool]]) -> dict[str, bytes]:
+    """The texts, by path, that `make` returns, and keeps if it says so: made now, or by a build with the same key."""
+    path = cache_folder() / f"{name}-{key}.json"
+    if path.exists():
+        os.utime(path)
+        return {file: text.encode() for file, text in json.loads(path.read_text(encoding="utf-8")).items()}
+    made, keep = make()
+    if keep:
+        keep_cached(path, json.dumps({file: content.decode() for file, content in made.items()}))
+    return made
+
+
+def _stage_keys(chapters: list[Chapter], with_solutions: bool) -> dict[str, str]:
+    """Of each chapter, and of the kill matrix, a hash of all that its part of the stage rests on: for a chapter its own text and outputs,
+    the names of pages and exercises in all others, and all code, as references and checks may take anything from it."""
+    code = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+    common = content_hash((), [*code, BIBLIOGRAPHY, ROOT / "requirements.txt", ROOT / "constraints.txt"])
+    names = [f"{chapter.page} {[cell.exercise for cell in chapter.exercises]}" for chapter in chapters]
+    keys = {
+        chapter.assignment: content_hash([common, str(with_solutions), *names], [chapter.path, cached(chapter)])
+        for chapter in chapters
+    }
+    titles = [f"{chapter.number}. {chapter.title}" for chapter in chapters]
+    records = [BOOK / "kill-matrix.md", *kept_records(), *RUNS.glob("*/*.parquet")]
+    return keys | {"kill-matrix": content_hash([common, *titles], records)}
+
+
+def _is_framed_anew(files: dict[str, bytes], work: Path) -> bool:
+    """Whether anything has changed that is on every page: the configuration, the theme, our style and scripts, the table of contents.
+    Sphinx would render again the pages whose own text has changed."""
+    shown = [files["_toc.yml"], *(content for name, content in sorted(files.items()) if name.startswith("vendor/"))]
+    pins = [ROOT / "_config.yml", ROOT / "requirements.txt", ROOT / "constraints.txt"]
+    frame = content_hash([JUPYTER_BOOK, *(hashlib.sha256(content).hexdigest() for content in shown)], pins)
+    seal = work.with_name(f"{work.name}-frame")
+    anew = not seal.exists() or seal.read_text(encoding="utf-8") != frame
+    seal.write_text(frame, encoding="utf-8")
+    return anew
 
 
 def staged_chapter(chapter: Chapter, outputs: assemble.Outputs, with_solutions: bool) -> dict[str, bytes]:
@@ -323,10 +387,15 @@ def _build_key(chapters: list[Chapter], with_solutions: bool) -> str:
     more of the code than their outputs rest on, and rendering them again is quick."""
     own = [path for path in BOOK.rglob("*") if path.is_file() and not path.relative_to(BOOK).parts[0].startswith("_")]
     code = [path for folder in ("autograder", "course_lib", "solutions") for path in (ROOT / folder).rglob("*.py")]
-    kept = [*(ROOT / "autograder" / "proving" / "records").glob("*.json"), ROOT / "requirements.txt", ROOT / "constraints.txt"]
+    kept = [*kept_records(), ROOT / "requirements.txt", ROOT / "constraints.txt"]
     chapters_own = [chapter.path for chapter in chapters]
     outputs = [execution_key(chapter) for chapter in chapters]
     return content_hash([str(with_solutions), *outputs], [*own, *code, *kept, ROOT / "_config.yml", *chapters_own])
+
+
+def kept_records() -> list[Path]:
+    """The files of autograder.proving.kept, which this module does not import, as it loads torch."""
+    return sorted((ROOT / "autograder" / "proving" / "records").glob("*.json"))
 
 
 def _is_current(out: Path, key: str) -> bool:

@@ -64,12 +64,12 @@ def executed_outputs(chapter: Chapter) -> list[list[NotebookNode]]:
 
     Raises: BookError if a cell fails, writes to stderr, shows a kernel-bound widget, or a check does not pass.
     """
-    cached = _cached(chapter)
-    if cached.exists():
-        os.utime(cached)  # so that the states that are in use are those that are kept
+    kept = cached(chapter)
+    if kept.exists():
+        os.utime(kept)  # so that the states that are in use are those that are kept
     else:
-        keep_cached(cached, nbformat.writes(_execute(chapter)))
-    return [cell.outputs for cell in nbformat.read(cached, as_version=4).cells]
+        keep_cached(kept, nbformat.writes(_execute(chapter)))
+    return [cell.outputs for cell in nbformat.read(kept, as_version=4).cells]
 
 
 def run_all(chapters: Sequence[Chapter], jobs: int | None = None, first: Callable[[], None] | None = None) -> None:
@@ -78,7 +78,7 @@ def run_all(chapters: Sequence[Chapter], jobs: int | None = None, first: Callabl
 
     Raises: BookError with everything that failed, after all others have been run.
     """
-    waiting = sorted((chapter for chapter in chapters if not _cached(chapter).exists()), key=_last_seconds, reverse=True)
+    waiting = sorted((chapter for chapter in chapters if not cached(chapter).exists()), key=_last_seconds, reverse=True)
     if waiting and first:
         first()
     failures = []
@@ -101,7 +101,8 @@ def _last_seconds(chapter: Chapter) -> float:
     return json.loads(kept[-1].read_text(encoding="utf-8"))["metadata"].get("cpu_seconds", 0.0) if kept else float("inf")
 
 
-def _cached(chapter: Chapter) -> Path:
+def cached(chapter: Chapter) -> Path:
+    """Where the chapter's outputs are kept, once it has run."""
     return cache_folder() / f"{chapter.assignment}-{execution_key(chapter)}.ipynb"
 
 

@@ -293,6 +293,88 @@ def test_staging_touches_changed_files_only_and_removes_what_has_gone(tmp_path):
     assert not (tmp_path / "two").exists()
 
 
+@pytest.fixture
+def stage_keys(tiny, elsewhere, monkeypatch):
+    """The keys of the tiny course's stage: stage_keys(old, new) with an edit in the text of chapter 99."""
+    monkeypatch.setattr(book, "ROOT", elsewhere)
+    monkeypatch.setattr(book, "cached", lambda chapter: elsewhere / f"{chapter.assignment}.ipynb")
+    for name in ("ch98", "ch99"):
+        (elsewhere / f"{name}.ipynb").write_text("outputs")
+
+    def keys(old="", new="", with_solutions=True):
+        return book._stage_keys([tiny.before, edited(tiny.chapter, old, new, elsewhere)], with_solutions)
+
+    return keys
+
+
+def test_prose_makes_its_own_chapter_anew_and_no_other(stage_keys):
+    before, after = stage_keys(), stage_keys("- In a list:", "- In one list:")
+    assert {name for name, key in after.items() if key != before[name]} == {"ch99"}
+
+
+def test_a_title_is_in_the_kill_matrix_too_and_an_exercise_concerns_all_chapters(stage_keys):
+    before = stage_keys()
+    titled, named = stage_keys("A tiny chapter", "A small chapter"), stage_keys("exercise: double", "exercise: twofold")
+    assert {name for name, key in titled.items() if key != before[name]} == {"ch99", "kill-matrix"}
+    assert {name for name, key in named.items() if key != before[name]} == {"ch98", "ch99"}
+
+
+@pytest.mark.parametrize("file", ["course_lib/one.py", "solutions/ch46.py", "autograder/checks/ch99.py", "constraints.txt"])
+def test_code_and_pins_make_the_whole_stage_anew(stage_keys, elsewhere, file):
+    before = stage_keys()
+    (elsewhere / file).write_text((elsewhere / file).read_text() + "# changed")
+    assert not before.items() & stage_keys().items()
+
+
+def test_outputs_and_the_edition_make_a_chapter_anew_and_a_record_the_kill_matrix(stage_keys, elsewhere):
+    before = stage_keys()
+    assert {name for name, key in stage_keys(with_solutions=False).items() if key != before[name]} == {"ch98", "ch99"}
+    (elsewhere / "ch98.ipynb").write_text("other outputs")
+    (elsewhere / "autograder/proving/records").mkdir(parents=True)
+    (elsewhere / "autograder/proving/records/ch99.json").write_text("{}")
+    assert {name for name, key in stage_keys().items() if key != before[name]} == {"ch98", "kill-matrix"}
+
+
+def test_a_part_of_the_stage_is_made_once_unless_it_must_not_be_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(book, "cache_folder", lambda: tmp_path)
+    made = []
+
+    def make(keep):
+        made.append(keep)
+        return {"a.md": "größer".encode()}, keep
+
+    for key, keep in (("1", True), ("1", True), ("2", True), ("3", False), ("3", False)):
+        assert book._kept("part", key, lambda keep=keep: make(keep)) == {"a.md": "größer".encode()}
+    assert made == [True, True, False, False]
+
+
+def test_an_unproved_exercise_is_told_by_each_build(tiny, monkeypatch):
+    monkeypatch.setattr(book, "kill_rows", lambda chapter, keys: [{"exercise": "double", "unproved": "Never proved."}])
+    files, keep = book._staged_kill_matrix([tiny.chapter])
+    assert b"Never proved." in files["kill-matrix.md"] and not keep
+    monkeypatch.setattr(book, "kill_rows", lambda chapter, keys: [])
+    assert book._staged_kill_matrix([tiny.chapter])[1]
+
+
+def test_what_is_on_every_page_renders_every_page_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(book, "ROOT", tmp_path)
+    names = ("_config.yml", "requirements.txt", "constraints.txt")
+    for name in names:
+        (tmp_path / name).write_text("")
+    files = {"_toc.yml": b"", "vendor/course.css": b"", "vendor/course.js": b"", "index.md": b"", "chapters/ch99_tiny.ipynb": b""}
+
+    def anew():
+        return book._is_framed_anew(files, tmp_path / "sphinx")
+
+    assert anew() and not anew()
+    for name in names:
+        (tmp_path / name).write_text("# changed")
+        assert anew() and not anew(), name
+    for name in files:
+        files[name] = b"changed"
+        assert anew() == (name not in ("index.md", "chapters/ch99_tiny.ipynb")), name
+
+
 @pytest.fixture(scope="module")
 def bare(tiny, tmp_path_factory):
     """The tiny course's book without solutions, built in a folder of its own."""
@@ -303,6 +385,9 @@ def bare(tiny, tmp_path_factory):
         patch.setattr(book, "run_all", lambda chapters, first: None)
         patch.setattr(book, "kill_rows", lambda chapter, keys: [])
         patch.setattr(book, "_build_key", lambda chapters, with_solutions: "tiny")
+        patch.setattr(
+            book, "_stage_keys", lambda chapters, with_solutions: dict.fromkeys(("ch98", "ch99", "kill-matrix"), "tiny")
+        )
         patch.setattr(book, "cache_folder", lambda: folder)
         patch.setattr(book, "STAGE", folder / "stage")
         patch.setattr(assemble, "real_sources", tiny.sources)
