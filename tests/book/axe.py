@@ -13,13 +13,14 @@ from axe_playwright_python.base import AXE_SCRIPT
 
 DISTINCT = Path(__file__).with_name("distinct.js").read_text(encoding="utf-8")
 MARK = "one-of-its-kind"
-ONCE = """async (mark) => {
+COLOURS = ["color-contrast", "link-in-text-block"]  # axe's rules on colours, of those that run unless they are asked for
+ONCE = """async ([mark, only]) => {
   const marked = `[xmlns="${mark}"]`, unmark = (node) => node.removeAttribute("xmlns");
   const run = (options) => axe.run({...options, elementRef: true, resultTypes: ["violations", "incomplete"]});
   const untold = (results) => results.incomplete.filter((one) => one.id === "color-contrast");
   const uneven = (node) => node.any.some((check) => ["bgGradient", "bgImage"].includes(check.data?.messageKey));
   axe.configure({rules: [{id: "color-contrast", selector: marked}]});
-  const runs = [await run({})];
+  const runs = [await run(only ? {runOnly: only} : {})];
   const kinds = new Map([...alike.values()].map((kind) => [kind[0], kind]));
   const others = untold(runs[0]).flatMap((one) => one.nodes).flatMap((node) => kinds.get(node.element)?.slice(1) ?? []);
   document.querySelectorAll(marked).forEach(unmark);
@@ -38,11 +39,11 @@ ONCE = """async (mark) => {
 EVERYWHERE = "axe.reset(), axe.run({resultTypes: ['violations']}).then((found) => found.violations)"
 
 
-def violations(page) -> list[dict]:
+def violations(page, colours_only: bool = False) -> list[dict]:
     """The rules that the page breaks: {id, impact, nodes: [{target, failureSummary}]}."""
     page.evaluate(AXE_SCRIPT)
     page.evaluate(DISTINCT, MARK)
-    return page.evaluate(ONCE, MARK)
+    return page.evaluate(ONCE, [MARK, COLOURS if colours_only else None])
 
 
 def violations_everywhere(page) -> list[dict]:

@@ -57,8 +57,10 @@ def test_each_kind_of_violation_is_found_where_it_is(browser, html, look):
                 [place, what.replace("ID", f"wrong-{at}")],
             )
         found = axe.grave(axe.violations(visit.page))
+        colours = axe.grave(axe.violations(visit.page, colours_only=True))
     for at, (kind, (rule, _, _)) in enumerate(WRONG.items()):
         assert any(line.startswith(f"{rule}: ") and f"#wrong-{at}'" in line for line in found), f"{kind}: not among {found}"
+    assert colours == [line for line in found if line.startswith(tuple(f"{rule}: " for rule in axe.COLOURS))] != found
 
 
 @pytest.mark.parametrize(("chapter", "look"), list(zip(LONGEST, ["light", "dark"], strict=True)), ids=["light", "dark"])

@@ -1,4 +1,5 @@
-"""The built pages as a reader meets them: opened from disk, with no network. Each page is visited once in each look."""
+"""The built pages as a reader meets them: opened from disk, with no network. Each page is visited twice: on a phone, and at a desk, in
+the dark, where the light is then switched on."""
 
 from __future__ import annotations
 
@@ -9,13 +10,15 @@ import pytest
 from autograder.authoring.chapter import all_chapters
 from autograder.authoring.contract import references, sources
 from autograder.publishing.book import docname
-from tests.book.visit import CHAPTERS, LOOKS, PAGES, Visit, look_at
+from tests.book.visit import CHAPTERS, LOOKS, PAGES, Visit, look_at_phone, look_at_wide
 
 
 @pytest.fixture(scope="module")
 def seen(browser, html):
     """What a page shows in a look: seen(name, look)."""
-    return functools.cache(functools.partial(look_at, browser, html))
+    wide = functools.cache(functools.partial(look_at_wide, browser, html))
+    phone = functools.cache(functools.partial(look_at_phone, browser, html))
+    return lambda name, look: phone(name) if look == "phone" else wide(name)[look]
 
 
 @pytest.mark.parametrize("look", LOOKS)

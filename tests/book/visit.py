@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from autograder.authoring.chapter import all_chapters
@@ -48,7 +48,7 @@ class Visit:
 
 @dataclass(frozen=True)
 class Seen:
-    """A page in one look, written down in one visit; lists name places."""
+    """A page in one look, written down as it was visited; lists name places."""
 
     requests: list[str]
     complaints: list[str]
@@ -58,11 +58,13 @@ class Seen:
     equations_wider_than_their_column: list[str]
     equations_with_errors: list[str]
     equations_not_rendered: list[str]
-    code_cut_off: list[dict]  # of input cells, folded or not, blocks that are wider than their column: {lines, columns that fit}
     downloads: list[str]  # where the links to notebooks lead
     references: list[tuple[str, bool]]  # the folds with reference solutions: text, open?
-    paper: dict | None  # what the page shows in print; of chapters, in the dark
-    violations: list[str]  # of axe's rules, serious or critical, with every fold open and every quiz answered
+    code_cut_off: list[dict] = field(default_factory=list)
+    """Of input cells, folded or not, blocks that are wider than their column: {lines, columns that fit}. Not on phones."""
+    paper: dict | None = None  # what the page shows in print; of chapters, in the dark
+    violations: list[str] = field(default_factory=list)
+    """Of axe's rules, serious or critical, with every fold open and every quiz answered. Not on phones."""
 
 
 EQUATIONS = """() => {
@@ -92,38 +94,68 @@ WIDTH = "document.documentElement.scrollWidth"
 OPEN = "document.querySelectorAll('details').forEach(fold => { fold.open = true; })"
 
 
-def look_at(browser, html: Path, name: str, look: str) -> Seen:
-    """All that is to be seen on a page without touching it, and then, with every fold open and every quiz answered, by axe."""
+VISIBLE = (
+    "[...document.querySelectorAll('body *')].map((one) => Number(one.checkVisibility({visibilityProperty: true}))).join('')"
+)
+STILL = """theme => new Promise((done) => {
+  const ends = (one) => Number.isFinite(one.effect?.getComputedTiming().endTime);
+  const look = () => document.documentElement.dataset.theme === theme
+    ? Promise.allSettled(document.getAnimations().filter(ends).map((one) => one.finished)).then(() => done())
+    : requestAnimationFrame(look);
+  look();
+})"""
+
+
+def look_at_wide(browser, html: Path, name: str) -> dict[str, Seen]:
+    """A page loaded in the dark, and looked at in the dark and in the light: untouched, and then, with every fold open and every quiz
+    answered, by axe. Its rules on anything but colours see the same page twice, so they run twice only if what is visible differs."""
+    with Visit(browser, html / f"{name}.html", "dark") as visit:
+        page = visit.page
+        seen = {"dark": _untouched(visit, name, "dark")}
+        paper = _on_paper(page, name) if name in CHAPTERS else None
+        _turn(page, "light")
+        seen["light"] = _untouched(visit, name, "light")
+        page.evaluate(OPEN)
+        code_cut_off = page.evaluate(CODE)
+        for answer in page.locator("div.quiz label:last-of-type input").all():
+            answer.check()
+        visible = page.evaluate(VISIBLE)
+        in_the_light = axe.grave(axe.violations(page))
+        _turn(page, "dark")
+        in_the_dark = axe.grave(axe.violations(page, colours_only=page.evaluate(VISIBLE) == visible))
+    return {
+        "dark": replace(seen["dark"], code_cut_off=code_cut_off, paper=paper, violations=in_the_dark),
+        "light": replace(seen["light"], code_cut_off=code_cut_off, violations=in_the_light),
+    }
+
+
+def look_at_phone(browser, html: Path, name: str) -> Seen:
+    """A page as a phone shows it, untouched, in the light."""
+    with Visit(browser, html / f"{name}.html", "phone") as visit:
+        return _untouched(visit, name, "phone")
+
+
+def _untouched(visit: Visit, name: str, look: str) -> Seen:
+    """All that is to be seen on a page without touching it."""
     SCREENSHOTS.mkdir(exist_ok=True)
-    with Visit(browser, html / f"{name}.html", look) as visit:
-        page, picture = visit.page, SCREENSHOTS / f"{Path(name).name}-{look}.png"
-        page.wait_for_timeout(200)  # whatever scripts load late
-        page.screenshot(path=picture, full_page=True)
-        width = page.evaluate(WIDTH)
-        equations = page.evaluate(EQUATIONS)
-        downloads = page.locator("article a[href$='.ipynb']").evaluate_all("all => all.map(one => one.getAttribute('href'))")
-        folds = page.locator("details", has_text="Reference solution")
-        references = folds.evaluate_all("all => all.map(one => [one.textContent, one.open])")
-        paper = _on_paper(page, name) if look == "dark" and name in CHAPTERS else None
-        requests, complaints = list(visit.requests), list(visit.complaints)  # before axe reads style sheets
-        violations, code_cut_off = [], []
-        if look != "phone":
-            page.evaluate(OPEN)
-            code_cut_off = page.evaluate(CODE)
-            for answer in page.locator("div.quiz label:last-of-type input").all():
-                answer.check()
-            violations = axe.grave(axe.violations(page))
+    page = visit.page
+    page.wait_for_timeout(200)  # whatever scripts load late
+    page.screenshot(path=SCREENSHOTS / f"{Path(name).name}-{look}.png", full_page=True)
+    folds = page.locator("details", has_text="Reference solution")
     return Seen(
-        requests,
-        complaints,
-        width,
-        **equations,
-        code_cut_off=code_cut_off,
-        downloads=downloads,
-        references=references,
-        paper=paper,
-        violations=violations,
+        width=page.evaluate(WIDTH),
+        **page.evaluate(EQUATIONS),
+        downloads=page.locator("article a[href$='.ipynb']").evaluate_all("all => all.map(one => one.getAttribute('href'))"),
+        references=folds.evaluate_all("all => all.map(one => [one.textContent, one.open])"),
+        requests=list(visit.requests),  # before axe reads style sheets
+        complaints=list(visit.complaints),
     )
+
+
+def _turn(page, theme: str) -> None:
+    """Follow the reader's system from the dark into the light, or back, and wait until nothing moves."""
+    page.emulate_media(color_scheme=theme)
+    page.evaluate(STILL, theme)
 
 
 def _on_paper(page, name: str) -> dict:
@@ -143,5 +175,5 @@ def _on_paper(page, name: str) -> dict:
     }
     page.set_viewport_size(before)
     page.emulate_media(media="screen")
-    page.wait_for_function("document.documentElement.dataset.theme === 'dark'")
+    page.evaluate(STILL, "dark")
     return paper
