@@ -30,7 +30,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context
 from pathlib import Path
 from threading import Thread
 from types import ModuleType
@@ -40,10 +40,11 @@ from uuid import uuid4
 import psutil
 
 from course_lib.figures import records
+from experiments import pool
 
 FOLDER = Path(__file__).parent
 RUNS = FOLDER / "runs"
-NOT_EXPERIMENTS = {"__init__", "campaign", "checkpoint", "snapshots"}
+NOT_EXPERIMENTS = {"__init__", "campaign", "checkpoint", "pool", "snapshots"}
 PACKAGES = ("torch", "numpy", "gymnasium", "Box2D", "mujoco", "transformers")  # what decides results, where installed
 LOCK, CLOCK = ".lock", ".seconds"
 
@@ -336,16 +337,7 @@ def _begin(queue: Any) -> None:
     """In a new process of the pool, before torch is loaded."""
     global _queue
     _queue = queue
-    os.environ["OMP_NUM_THREADS"] = "1"
-    Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """A pool's process whose parent was killed would go on, and wait for ever; here the next `course experiment` takes over."""
-    parent = parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
+    pool.begin()  # after a kill, the next `course experiment` takes over at once
 
 
 def _in_pool(task: Task) -> Outcome:
@@ -362,13 +354,13 @@ def _here(waiting: list[Task], jobs: int, progress: Progress) -> Iterator[Outcom
 
     listener = Thread(target=listen, daemon=True)
     listener.start()
-    pool = ProcessPoolExecutor(min(jobs, len(waiting)), context, _begin, (queue,))
-    futures = {pool.submit(_in_pool, task): task for task in waiting}
+    executor = ProcessPoolExecutor(min(jobs, len(waiting)), context, _begin, (queue,))
+    futures = {executor.submit(_in_pool, task): task for task in waiting}
     try:
         for future in as_completed(futures):
             yield _outcome(futures[future], future)
     finally:
-        pool.shutdown(cancel_futures=True)
+        executor.shutdown(cancel_futures=True)
         queue.put(None)
         listener.join()
 

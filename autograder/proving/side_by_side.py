@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context, parent_process
-from threading import Thread
+from multiprocessing import get_context
 from typing import Generic, TypeVar
+
+from experiments import pool
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -49,28 +49,14 @@ def run(
                 yield Done(item, None, error)
 
 
-def _begin() -> None:
-    """In a new process, before torch is loaded."""
-    os.environ["OMP_NUM_THREADS"] = "1"
-    Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """A process whose parent was killed would go on, and wait for ever."""
-    parent = parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
 def _here(function: Callable[[Item], Result], items: Sequence[Item], jobs: int) -> Iterator[Done[Item, Result]]:
-    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _begin)  # a forked child would share torch's state
-    futures = {pool.submit(function, item): item for item in items}
+    executor = ProcessPoolExecutor(jobs, get_context("spawn"), pool.begin)  # a forked child would share torch's state
+    futures = {executor.submit(function, item): item for item in items}
     try:
         for future in as_completed(futures):
             yield _done(futures[future], future)
     finally:
-        pool.shutdown(cancel_futures=True)
+        executor.shutdown(cancel_futures=True)
 
 
 def _on_dask(function: Callable[[Item], Result], items: Sequence[Item], scheduler: str) -> Iterator[Done[Item, Result]]:
