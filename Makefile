@@ -8,12 +8,12 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v p
 SHELL := /bin/bash -o pipefail
 BIN := .venv/bin
 INSTALLED := .venv/.installed
-WHOLE_MACHINE := tests/e2e tests/field tests/attacks tests/faults # they grade with a job for each core, under short time limits
+WHOLE_MACHINE := tests/field tests/attacks tests/faults # they grade with a job for each core, under short time limits
 TWO_AT_A_TIME := $(WHOLE_MACHINE:%=--ignore=%)
 IN_GROUPS := -n 2 --dist loadgroup --no-loadscope-reorder # tests/groups.py says which, and puts the longest first
 ONE_CHAPTER = tests/solutions/test_$(ONLY).py tests/autograder/authoring/test_contract.py tests/autograder/proving/test_killmatrix.py \
   tests/autograder/publishing/test_release.py tests/book/test_pages.py tests/book/test_widgets.py tests/e2e/test_every_answer.py
-QUICK := $(TWO_AT_A_TIME) --ignore=tests/book --ignore=tests/autograder/proving/test_killmatrix.py
+QUICK := $(TWO_AT_A_TIME) --ignore=tests/e2e --ignore=tests/book --ignore=tests/autograder/proving/test_killmatrix.py
 
 .PHONY: book release test check bench install clean
 

@@ -12,6 +12,8 @@ LONGEST = {
     "tests/autograder/grading/test_sandbox.py": 120,
     "tests/book/test_how_to.py": 100,
     "tests/e2e/test_every_answer.py": 90,
+    "tests/e2e/test_robots.py": 60,
+    "tests/e2e/test_stock_nbgrader.py": 60,
     "tests/autograder/publishing/test_run_all.py": 60,
 }
 A_PAGE = 60
