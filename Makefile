@@ -15,6 +15,8 @@ ONE_CHAPTER = tests/solutions/test_$(ONLY).py tests/autograder/authoring/test_co
   tests/autograder/publishing/test_release.py tests/book/test_pages.py tests/book/test_widgets.py tests/e2e/test_every_answer.py
 QUICK := $(TWO_AT_A_TIME) --ignore=tests/e2e --ignore=tests/book --ignore=tests/autograder/proving/test_killmatrix.py
 
+unexport PYTHONDONTWRITEBYTECODE # or each of a thousand processes compiles the project anew
+
 .PHONY: book release test check bench install clean
 
 book: install

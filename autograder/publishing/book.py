@@ -53,9 +53,8 @@ BOOK = ROOT / "book"
 STAGE = BOOK / "_stage"
 PUBLISHED = ("*.html", "searchindex.js", "_static/*", "_images/*", "_downloads/*")
 JUPYTER_BOOK = """
-import functools, importlib.metadata, json, sys
+import json, sys
 sys.modules["rfc3987_syntax"] = None  # as in autograder.cli
-importlib.metadata.entry_points = functools.cache(importlib.metadata.entry_points)  # for each reference, all packages are looked through
 import jupyter_book.sphinx, myst_nb.sphinx_ext, sphinx_book_theme, sphinxcontrib.bibtex
 from jupyter_book.cli.main import main
 main(json.loads(sys.stdin.read()))
