@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 sys.modules.setdefault("rfc3987_syntax", cast(ModuleType, None))
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, help=__doc__)
-OK, LOW_SCORES, BAD_INPUT, BROKEN = 0, 1, 2, 3
+OK, LOW_SCORES, BAD_INPUT, BROKEN, LEFT_OVER = 0, 1, 2, 3, 4
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
@@ -126,6 +126,60 @@ def check(notebook: Annotated[Path, typer.Argument(help="A student notebook.")])
     text = notebook.read_bytes().decode(errors="replace") if notebook.is_file() else ""  # what is wrong with it, `main` says
     freeze.write([exercise for exercise in checks.all_exercises() if f"check({exercise.name})" in text], client.FROZEN)
     raise typer.Exit(command.main([str(notebook)]))
+
+
+@app.command()
+def collect(
+    downloads: Annotated[
+        list[Path], typer.Argument(metavar="DOWNLOAD…", help="Folders or zips, as the platform hands them out.")
+    ],
+    into: Annotated[Path, typer.Option(metavar="SUBMITTED", help="Where STUDENT/ASSIGNMENT/ASSIGNMENT.ipynb is laid out.")],
+    assignment: Annotated[str | None, typer.Option(help="As in ch44; by default the notebooks' names say it.")] = None,
+    names: Annotated[
+        Path | None, typer.Option(help="A CSV: a column student, and id, login, email or name; or a roster.")
+    ] = None,
+    due: Annotated[Path | None, typer.Option(help="A YAML file of due dates, extensions and a penalty for late work.")] = None,
+    platform: Annotated[
+        str | None,
+        typer.Option("--from", help="canvas, moodle, gradescope, blackboard, github or nbgrader, if it is not recognised."),
+    ] = None,
+    pattern: Annotated[
+        str | None, typer.Option(help="A regular expression for other names, as nbgrader's named_regexp: student_id, file_id, …")
+    ] = None,
+    best: Annotated[
+        bool, typer.Option("--best", help="Of several attempts keep the best, by grading them, not the last.")
+    ] = False,
+    timeout: Annotated[float, typer.Option(min=0.1, help="With --best: seconds for each exercise.")] = 60.0,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be collected, and write nothing.")] = False,
+) -> None:
+    """Lay out what a learning platform lets you download, for `course grade`. Nothing is overwritten: earlier attempts are kept.
+
+    Exit status: 0 all was understood, 2 bad input, 3 the grader failed (--best), 4 collected, but some of it was not understood.
+    """
+    from autograder.platforms import attempts, collect, roster
+    from autograder.platforms import downloads as formats
+
+    if platform and platform not in formats.PLATFORMS:
+        _stop(f"--from {platform}: take one of {', '.join(formats.PLATFORMS)}")
+    from autograder.grading import deadlines, sandbox
+
+    try:
+        judge, environment = collect.grader(timeout) if best and not dry_run else (None, str)
+        done = collect.collect(downloads, into, assignment, names, due, platform, pattern, judge, environment, dry_run)
+    except (
+        collect.CollectError, roster.RosterError, deadlines.DeadlineError, attempts.BrokenIndex, sandbox.SandboxUnavailable,
+    ) as error:  # fmt: skip
+        _stop(error)
+    except RuntimeError as error:
+        _stop(f"{error}; collect again: what was handed in is kept", BROKEN)
+    except OSError as error:
+        _stop(f"the submissions cannot be written: {error}. What is written is whole; mend this and collect again.", BROKEN)
+    Console(highlight=False).print(collect.table(done.entries))
+    for line in done.notes + done.problems:
+        print(line)
+    print(collect.summary(done, into, dry_run))
+    if done.problems:
+        raise typer.Exit(LEFT_OVER)
 
 
 @app.command()
