@@ -175,9 +175,11 @@ def collect(
     except OSError as error:
         _stop(f"the submissions cannot be written: {error}. What is written is whole; mend this and collect again.", BROKEN)
     Console(highlight=False).print(collect.table(done.entries))
-    for line in done.notes + done.problems:
+    for line in done.notes:
         print(line)
-    print(collect.summary(done, into, dry_run))
+    print(collect.summary(done, into, dry_run), flush=True)
+    for line in done.problems:
+        err.print(f"course: not understood: {line}", markup=False)
     if done.problems:
         raise typer.Exit(LEFT_OVER)
 
@@ -192,6 +194,9 @@ def grade(
     db_url: Annotated[str | None, typer.Option(help="nbgrader's gradebook; sqlite:///OUT/gradebook.db by default.")] = None,
     fail_under: Annotated[
         float | None, typer.Option(min=0.0, max=1.0, help="Exit with 1 if a submission scores less than this share.")
+    ] = None,
+    due: Annotated[
+        Path | None, typer.Option(help="A YAML file of due dates, extensions and a penalty; SUBMITTED/.due.yml by default.")
     ] = None,
     trust_submissions: Annotated[
         bool,
@@ -211,7 +216,7 @@ def grade(
         try:
             results = grade.grade(
                 submitted, out, jobs, scheduler, timeout, db_url, trust_submissions,
-                lambda done, total, name: bar.update(task, completed=done, total=total),
+                lambda done, total, name: bar.update(task, completed=done, total=total), due=due,
             )  # fmt: skip
         except (grade.GradingError, sandbox.SandboxUnavailable) as error:
             bar.stop()

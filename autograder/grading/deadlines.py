@@ -26,6 +26,8 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import yaml
 
+from autograder.grading.intake import BadFile, read_regular
+
 FILE = ".due.yml"  # in SUBMITTED: `course grade` ignores names that begin with a dot, but for this one
 TIMESTAMP = "timestamp.txt"  # beside the notebook, as nbgrader's exchange writes it
 MAX_BYTES = 1 << 20
@@ -260,3 +262,31 @@ def timestamp(text: str) -> datetime:
     """What a `timestamp.txt` says, in UTC; without a zone it is UTC, as nbgrader takes it. Raises: ValueError."""
     moment = parse(text)
     return moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
+
+
+@dataclass(frozen=True)
+class HandedIn:
+    """What nbgrader's gradebook says of a submission beside its points. `ruled`: a due date is known, so that `extension` and `share`, the
+    part of the points that being late costs, are facts; otherwise whatever the gradebook holds stays."""
+
+    at: datetime | None = None
+    ruled: bool = False
+    extension: timedelta | None = None
+    share: float = 0.0
+
+
+def handed_in(folder: Path, student: str, assignment: str, deadlines: Deadlines) -> HandedIn:
+    """Of one submission, by the `timestamp.txt` in its folder. Raises: ValueError if there is one that says no time."""
+    rule = deadlines.rules.get(assignment)
+    ruled, extension = rule is not None, rule.extension(student) if rule else None
+    try:
+        content = read_regular(folder / TIMESTAMP, 1000)
+    except FileNotFoundError:
+        return HandedIn(None, ruled, extension)
+    except (BadFile, OSError) as error:
+        raise ValueError(f"{TIMESTAMP} {error}") from None
+    try:
+        at = timestamp(content.decode())
+    except ValueError:
+        raise ValueError(f"{TIMESTAMP} says no time as nbgrader writes it (2026-11-20 23:59:00.000000 UTC)") from None
+    return HandedIn(at, ruled, extension, rule.late(student, at)[1] if rule else 0.0)

@@ -546,5 +546,4 @@ def summary(done: Collected, into: Path, dry_run: bool) -> str:
     students = len({entry["student"] for entry in done.entries})
     what = f"{len(done.entries)} submission{'s' * (len(done.entries) != 1)} of {students} student{'s' * (students != 1)}"
     where = f"would be collected into {into}" if dry_run else f"collected into {into}"
-    left = f"; the {len(done.problems)} lines above need a look" if len(done.problems) > 1 else "; the line above needs a look"
-    return f"{what} {where}{left if done.problems else ''}"
+    return f"{what} {where}"
