@@ -524,6 +524,7 @@ def grader(timeout: float) -> tuple[Judge, Callable[[], str]]:
 def table(entries: Collection[dict[str, Any]]) -> Table:
     """Whose file was recognised as what."""
     result = Table("Student", "Assignment", "From", "In the download", "Attempt", "Late")
+    result.columns[3].overflow = "fold"  # whole names, for finding them
     for entry in entries:
         attempt = str(entry["attempt"]) + (f", {entry['submitted_at'][:16].replace('T', ' ')}" if entry["submitted_at"] else "")
         cells = (entry["student"], entry["assignment"], entry["platform"], entry["download"], attempt, lateness(entry))
