@@ -33,6 +33,7 @@ KNOWN_RUN = 7  # of one that explains; shorter, so that a small change to a know
 LEAST = 25  # unexplained tokens that a pair must share to be listed: two or three lines
 COMMON = 0.1  # of the class: what so many have is a form that the course suggests
 COMMON_AT_LEAST = 6  # submissions, in a small class
+SHOWN = 200  # pairs on the terminal
 MAX_TOKENS = 20_000  # of one submission
 NOT_A_VERDICT = (
     "A list to look at, not a verdict: what two submissions share beyond the release and the known right answers, and not why."
@@ -116,6 +117,8 @@ def find(submitted: Path, assignment: str | None = None, at_least: float = 0.6) 
         read = []
         for student, path in papers:
             try:
+                if not path.is_file():
+                    raise intake.BadFile(f"there is no notebook {name}.ipynb")
                 read.append(task.paper(student, intake.parse(intake.read_regular(path, intake.MAX_NOTEBOOK))))
             except (intake.BadNotebook, intake.BadFile, OSError) as problem:
                 problems.append(f"{student}/{name}: not compared: {problem}")
@@ -130,7 +133,7 @@ def _submissions(submitted: Path, names: set[str]) -> dict[str, list[tuple[str, 
             continue
         for name in sorted(names):
             path = student / name / f"{name}.ipynb"
-            if path.is_file() and not path.parent.is_symlink():
+            if path.parent.is_dir() and not path.parent.is_symlink():
                 found[name].append((clean_text(student.name, 200), path))
     return found
 
@@ -303,7 +306,7 @@ def _longest(one: Paper, other: Paper, runs: list[int]) -> Passage:
 def table(pairs: Iterable[Pair]) -> Table:
     """The pairs for a terminal."""
     result = Table("Students", "Assignment", "Alike", "Where", "Longest shared passage")
-    for pair in pairs:
+    for pair in list(pairs)[:SHOWN]:
         one, other = pair.longest.first, pair.longest.second
         cells = (" and ".join(pair.students), pair.assignment, f"{pair.similarity:.0%}", ", ".join(pair.exercises))
         result.add_row(*(Text(clean_text(cell, 400)) for cell in cells), Text(f"{_place(one)}; {_place(other)}"))
@@ -313,7 +316,8 @@ def table(pairs: Iterable[Pair]) -> Table:
 def summary(pairs: Sequence[Pair], at_least: float) -> str:
     """The last line."""
     found = f"{len(pairs)} pair{'s' * (len(pairs) != 1)}" if pairs else "No pair"
-    return f"{found} of submissions share{'s' * (len(pairs) < 2)} at least {at_least:.0%} of what is their own"
+    more = f"; the first {SHOWN} are shown, --out writes all" if len(pairs) > SHOWN else ""
+    return f"{found} of submissions share{'s' * (len(pairs) < 2)} at least {at_least:.0%} of what is their own{more}"
 
 
 def _place(place: tuple[int, int, int]) -> str:

@@ -195,7 +195,9 @@ def test_the_command_lists_pairs_says_that_it_is_no_verdict_and_writes_a_table(s
 
 def test_what_cannot_be_compared_is_named(submitted, tmp_path):
     (submitted / "cyd" / "ch44" / "ch44.ipynb").write_text("no notebook")
+    (submitted / "dan" / "ch44").mkdir(parents=True)
     done = run(submitted)
+    assert "dan/ch44: not compared: there is no notebook ch44.ipynb" in done.output
     assert done.exit_code == 4 and "cyd/ch44: not compared" in done.output and "=bob and ada" in done.output
     for arguments, said in (
         ([tmp_path / "nowhere"], "no such folder"),
