@@ -90,7 +90,7 @@ def _write_all(
             results.append(_write(verdict, notebook, out, book, releases))
             progress(len(results), len(tasks), f"{verdict.student}/{verdict.assignment}")
         try:
-            exports.write_all(out, book)
+            exports.write_all(out, book, results)
         except ValueError as error:  # a verdict file that somebody has damaged
             raise GradingError(str(error)) from None
     return sorted(results, key=lambda verdict: (verdict.student, verdict.assignment))
