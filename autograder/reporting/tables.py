@@ -9,6 +9,7 @@ import csv
 import io
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from autograder.grading.verdicts import FINAL, Verdict, clean_text
@@ -76,6 +77,8 @@ _CANVAS_HEADER = ("Student", "ID", "SIS User ID", "SIS Login ID", "Section")
 _LOGIN = re.compile(r"[-+@]?[\w.][\w.@-]*\Z")  # a name after a sign calls nothing in a spreadsheet, and Canvas must find it
 _NUMBER = re.compile(r"-?[0-9.,]+%?\Z")
 
+Column = tuple[float, dict[str, float]]  # points possible, and student → points
+
 
 def canvas_csv(grades: Sequence[Mapping[str, Any]]) -> str:
     """Canvas's gradebook import: for each assignment the automatic points, and those by hand in a column of their own.
@@ -85,22 +88,24 @@ def canvas_csv(grades: Sequence[Mapping[str, Any]]) -> str:
     Canvas finds a student by ID (nbgrader's `lms_user_id`, if the gradebook has it) or by login (the submission's folder).
     """
     columns = canvas_columns(grades)
+    return canvas_table({name: columns[name] for name in without_blanks(columns)}, who(grades))
+
+
+def without_blanks(columns: Mapping[str, Column]) -> list[str]:
+    """The columns of the largest table without blanks, of those that put the columns that most students have first."""
     names = sorted(columns, key=lambda name: (-len(columns[name][1]), name))
     chosen, cells = [], 0
     for count in range(1, len(names) + 1):
         students = set.intersection(*(set(columns[name][1]) for name in names[:count]))
         if count * len(students) > cells:
             chosen, cells = names[:count], count * len(students)
-    return canvas_table({name: columns[name] for name in sorted(chosen)}, who(grades))
+    return sorted(chosen)
 
 
 def canvas_files(grades: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     """One file for each column of Canvas, with the students who have points there: `canvas/ch44.csv`, `canvas/ch44 by hand.csv`."""
     people = who(grades)
     return {f"canvas/{name}.csv": canvas_table({name: column}, people) for name, column in canvas_columns(grades).items()}
-
-
-Column = tuple[float, dict[str, float]]  # points possible, and student → points
 
 
 def canvas_columns(grades: Iterable[Mapping[str, Any]]) -> dict[str, Column]:
@@ -117,35 +122,46 @@ def canvas_columns(grades: Iterable[Mapping[str, Any]]) -> dict[str, Column]:
     return columns
 
 
-def who(grades: Iterable[Mapping[str, Any]]) -> dict[str, tuple[str, str | None]]:
-    """Student → name, last one first, and Canvas's ID, as far as the gradebook knows them."""
-    return {
-        row["student_id"]: (", ".join(filter(None, (row["last_name"], row["first_name"]))), row["lms_user_id"]) for row in grades
-    }
+@dataclass(frozen=True)
+class Person:
+    """How Canvas may know a student."""
+
+    name: str
+    login: str
+    identity: str | None = None  # Canvas's own number
 
 
-def canvas_table(columns: Mapping[str, Column], people: Mapping[str, tuple[str, str | None]]) -> str:
+def who(grades: Iterable[Mapping[str, Any]]) -> dict[str, Person]:
+    """Student → name, last one first, login (the submission's folder), and Canvas's ID, as far as the gradebook knows them."""
+    people = {}
+    for row in grades:
+        student, name = row["student_id"], ", ".join(filter(None, (row["last_name"], row["first_name"])))
+        people[student] = Person(name or student, student, row["lms_user_id"])
+    return people
+
+
+def canvas_table(columns: Mapping[str, Column], people: Mapping[str, Person]) -> str:
     """The CSV with these columns and the students who have all of them."""
     students = sorted(set.intersection(*(set(column[1]) for column in columns.values()))) if columns else []
     lines: list[list[Any]] = [["    Points Possible", "", "", "", "", *(points for points, _ in columns.values())]]
     for student in students:
-        name, identity = people.get(student, ("", None))
+        person = people[student]
         scores = [column[1][student] for column in columns.values()]
-        lines.append([name or student, identity, "", canvas_login(student, identity), "", *scores])
+        lines.append([person.name, person.identity, "", _canvas_login(person), "", *scores])
     return csv_text((*_CANVAS_HEADER, *columns), lines)
 
 
-def canvas_login(student: str, identity: str | None) -> str:
-    """The login that Canvas compares character by character; blank if it could be a formula and the ID is enough."""
-    if _LOGIN.match(student):
-        return Exact(student)
-    return "" if identity and cell(student) != student else student
+def _canvas_login(person: Person) -> str:
+    """The login, which Canvas compares character by character; blank if it could be a formula and the ID is enough."""
+    if _LOGIN.match(person.login):
+        return Exact(person.login)
+    return "" if person.identity and cell(person.login) != person.login else person.login
 
 
-def canvas_finds(student: str, identity: str | None) -> bool:
+def canvas_finds(person: Person) -> bool:
     """Whether Canvas's import can find a student: by ID, or by a login that survives the file and Canvas's way with numbers."""
-    login = cell(canvas_login(student, None))
-    return bool(identity) or (login == student and _as_canvas_reads(login) == student)
+    login = cell(_canvas_login(person))
+    return bool(person.identity) or (login == person.login and _as_canvas_reads(login) == person.login)
 
 
 def _as_canvas_reads(field: str) -> str:

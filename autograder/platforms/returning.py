@@ -1,0 +1,80 @@
+"""`course return`: one platform after the other is a module of its own, and this chooses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from autograder.grading import judge
+from autograder.grading.verdicts import write_atomically
+from autograder.platforms import classroom50, give_back_canvas, give_back_moodle, give_back_nbgrader, gradescope_archive
+from autograder.platforms.give_back import GiveBackError, Given, Result, load
+from autograder.reporting.machines import gradescope_json
+
+WITH_WORKSHEET = ("canvas", "moodle")
+
+
+@dataclass(frozen=True)
+class Request:
+    """What was asked for at the command line."""
+
+    grades: Path
+    submitted: Path | None = None
+    into: Path | None = None
+    worksheet: Path | None = None
+    only: tuple[str, ...] = ()
+    db_url: str | None = None
+    automatic: bool = False
+    trusted: bool = False
+
+
+def give_back(platform: str, request: Request) -> Given:
+    """Write the files of `platform`. Raises: GiveBackError if that cannot be; OSError if the disk is full."""
+    if request.worksheet is not None and platform not in WITH_WORKSHEET:
+        raise GiveBackError(f"{platform} has no worksheet to fill in: leave --worksheet out, or name --to canvas or --to moodle")
+    if request.automatic and platform != "moodle":
+        raise GiveBackError("--automatic is for Moodle: the other platforms get points by hand separately")
+    into = request.into or (request.grades if platform == "nbgrader" else request.grades / "return")
+    if platform == "gradescope":
+        return _gradescope(request, into)
+    results, given = load(request.grades, request.submitted, request.db_url, request.only)
+    if platform == "canvas":
+        give_back_canvas.write(results, into, given, request.worksheet)
+    elif platform == "moodle":
+        give_back_moodle.write(results, into, given, request.worksheet, request.automatic)
+    elif platform == "nbgrader":
+        give_back_nbgrader.write(results, into, given, request.submitted or Path("submitted"))
+    else:
+        classroom50.write(results, into, given)
+    return given
+
+
+def _gradescope(request: Request, into: Path) -> Given:
+    """An archive for Gradescope's container for each assignment, and the results of what was collected from Gradescope."""
+    graded = (request.grades / "verdicts").is_dir()
+    results: list[Result] = []
+    given = Given()
+    unknown = sorted(set(request.only) - judge.assignments())
+    if unknown:
+        raise GiveBackError(f"no such assignment: {', '.join(unknown)}; there are {', '.join(sorted(judge.assignments()))}")
+    if graded:
+        results, given = load(request.grades, request.submitted, request.db_url)
+        if request.only:
+            results = [result for result in results if result.assignment in request.only]
+            given.left_out = [line for line in given.left_out if line.split(":")[0].split(" ")[-1] in request.only]
+    assignments = request.only or tuple(sorted({result.assignment for result in results}))
+    if not assignments:
+        raise GiveBackError("which assignment is the archive to grade? Say it, as in --only ch44")
+    for name in assignments:
+        path = into / "gradescope" / f"{name}-autograder.zip"
+        given.files.append(write_atomically(path, gradescope_archive.archive(name, request.trusted)))
+    for result in results:
+        handed = result.handed
+        if handed and handed.platform == "gradescope" and (handed.platform_id or "").isdecimal():
+            path = into / "gradescope" / result.assignment / f"submission_{handed.platform_id}.json"
+            given.files.append(write_atomically(path, gradescope_json(result.verdict, result.marks, result.penalty)))
+    given.notes.append(
+        "Upload the archive under Configure Autograder, with Ubuntu 24.04. It holds the solutions. It grades only where bubblewrap may "
+        "start in Gradescope's container: test it there with a submission of your own."
+    )
+    return given
