@@ -68,7 +68,7 @@ def read(path: Path) -> Sheet:
         data = path.read_bytes()
     except OSError as error:
         raise GiveBackError(f"{path}: cannot be read ({error.strerror}); give the CSV file that the platform hands out") from None
-    if data.startswith(b"PK"):
+    if data.startswith(b"PK\x03\x04"):
         raise GiveBackError(f"{path}: this is a workbook or zip, not CSV; {again}")
     try:
         text = data.removeprefix(_BOM).decode()

@@ -183,7 +183,13 @@ def test_canvas_finds_odd_logins_and_no_cell_is_a_formula(writer):
     rows = table_of(exports.canvas_csv(writer.grades()))[2:]
     logins = [row[3] for row in rows]
     assert {student for student in odd if student in logins} == {*odd} - {"=cmd", "-2+3", "=cmd|' -C calc'!A0"}
-    assert [s for s in odd if not tables.canvas_finds(tables.Person("", s))] == ["=cmd", "-2+3", "=cmd|' -C calc'!A0", "1.234.567", "12,5"]
+    assert [s for s in odd if not tables.canvas_finds(tables.Person("", s))] == [
+        "=cmd",
+        "-2+3",
+        "=cmd|' -C calc'!A0",
+        "1.234.567",
+        "12,5",
+    ]
     assert all(tables.canvas_finds(tables.Person("", student, "4711")) for student in odd)
     name_of(writer, "=cmd", lms_user_id="4711")
     assert [
