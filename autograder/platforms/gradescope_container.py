@@ -9,7 +9,10 @@ autograder has failed, and nobody gets a zero.
 from __future__ import annotations
 
 import os
+import shutil
+import stat
 import sys
+import tempfile
 from pathlib import Path
 
 from autograder import grade
@@ -40,12 +43,21 @@ def main(arguments: list[str]) -> int:
             print(f"Not graded, because the submission could read the solutions: {error}", file=sys.stderr)
             return 3
     os.umask(0o077)
-    verdict, _ = grade.judge_folder("submission", assignment, root / "submission", TIMEOUT, trusted)
+    with tempfile.TemporaryDirectory() as folder:  # the grader's layout: the folder has the assignment's name
+        handed_in = Path(folder, "submission", assignment)
+        shutil.copytree(root / "submission", handed_in, symlinks=True, ignore=_neither_files_nor_folders)
+        verdict, _ = grade.judge_folder("submission", assignment, handed_in, TIMEOUT, trusted)
     if verdict.status == "infra_error":
         print(f"Not graded: {', '.join(verdict.flags)}", file=sys.stderr)
         return 3
     write_atomically(results, gradescope_json(verdict))
     return 0
+
+
+def _neither_files_nor_folders(folder: str, names: list[str]) -> list[str]:
+    """Pipes and devices, which a copy would wait for."""
+    paths = ((name, os.lstat(os.path.join(folder, name)).st_mode) for name in names)
+    return [name for name, mode in paths if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or stat.S_ISLNK(mode))]
 
 
 if __name__ == "__main__":
