@@ -130,6 +130,62 @@ def check(notebook: Annotated[Path, typer.Argument(help="A student notebook.")])
 
 
 @app.command()
+def collect(
+    downloads: Annotated[
+        list[Path], typer.Argument(metavar="DOWNLOAD…", help="Folders or zips, as the platform hands them out.")
+    ],
+    into: Annotated[Path, typer.Option(metavar="SUBMITTED", help="Where STUDENT/ASSIGNMENT/ASSIGNMENT.ipynb is laid out.")],
+    assignment: Annotated[str | None, typer.Option(help="As in ch44; by default the notebooks' names say it.")] = None,
+    names: Annotated[
+        Path | None, typer.Option(help="A CSV: a column student, and id, login, email or name; or a roster.")
+    ] = None,
+    due: Annotated[Path | None, typer.Option(help="A YAML file of due dates, extensions and a penalty for late work.")] = None,
+    platform: Annotated[
+        str | None,
+        typer.Option("--from", help="canvas, moodle, gradescope, blackboard, github or nbgrader, if it is not recognised."),
+    ] = None,
+    pattern: Annotated[
+        str | None, typer.Option(help="A regular expression for other names, as nbgrader's named_regexp: student_id, file_id, …")
+    ] = None,
+    best: Annotated[
+        bool, typer.Option("--best", help="Of several attempts keep the best, by grading them, not the last.")
+    ] = False,
+    timeout: Annotated[float, typer.Option(min=0.1, help="With --best: seconds for each exercise.")] = 60.0,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be collected, and write nothing.")] = False,
+) -> None:
+    """Lay out what a learning platform lets you download, for `course grade`. Nothing is overwritten: earlier attempts are kept.
+
+    Exit status: 0 all was understood, 2 bad input, 3 the grader failed (--best), 4 collected, but some of it was not understood.
+    """
+    from autograder.platforms import attempts, collect, roster
+    from autograder.platforms import downloads as formats
+
+    if platform and platform not in formats.PLATFORMS:
+        _stop(f"--from {platform}: take one of {', '.join(formats.PLATFORMS)}")
+    from autograder.grading import deadlines, sandbox
+
+    try:
+        judge, environment = collect.grader(timeout) if best and not dry_run else (None, str)
+        done = collect.collect(downloads, into, assignment, names, due, platform, pattern, judge, environment, dry_run)
+    except (
+        collect.CollectError, roster.RosterError, deadlines.DeadlineError, attempts.BrokenIndex, sandbox.SandboxUnavailable,
+    ) as error:  # fmt: skip
+        _stop(error)
+    except RuntimeError as error:
+        _stop(f"{error}; collect again: what was handed in is kept", BROKEN)
+    except OSError as error:
+        _stop(f"the submissions cannot be written: {error}. What is written is whole; mend this and collect again.", BROKEN)
+    Console(highlight=False).print(collect.table(done.entries))
+    for line in done.notes:
+        print(line)
+    print(collect.summary(done, into, dry_run), flush=True)
+    for line in done.problems:
+        err.print(f"course: not understood: {line}", markup=False)
+    if done.problems:
+        raise typer.Exit(LEFT_OVER)
+
+
+@app.command()
 def grade(
     submitted: Annotated[Path, typer.Argument(help="The folder that holds STUDENT/ASSIGNMENT/ASSIGNMENT.ipynb.")],
     out: Annotated[Path, typer.Option(help="Where verdicts, tables, reports and the gradebook go.")] = Path("grades"),
@@ -139,6 +195,9 @@ def grade(
     db_url: Annotated[str | None, typer.Option(help="nbgrader's gradebook; sqlite:///OUT/gradebook.db by default.")] = None,
     fail_under: Annotated[
         float | None, typer.Option(min=0.0, max=1.0, help="Exit with 1 if a submission scores less than this share.")
+    ] = None,
+    due: Annotated[
+        Path | None, typer.Option(help="A YAML file of due dates, extensions and a penalty; SUBMITTED/.due.yml by default.")
     ] = None,
     trust_submissions: Annotated[
         bool,
@@ -158,7 +217,7 @@ def grade(
         try:
             results = grade.grade(
                 submitted, out, jobs, scheduler, timeout, db_url, trust_submissions,
-                lambda done, total, name: bar.update(task, completed=done, total=total),
+                lambda done, total, name: bar.update(task, completed=done, total=total), due=due,
             )  # fmt: skip
         except (grade.GradingError, sandbox.SandboxUnavailable) as error:
             bar.stop()

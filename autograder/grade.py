@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING
 from nbformat import NotebookNode
 
 from autograder.authoring import assemble, chapter
-from autograder.grading import intake, judge, sandbox, verdicts
+from autograder.grading import deadlines, intake, judge, sandbox, verdicts
+from autograder.grading.deadlines import Deadlines, HandedIn
 from autograder.grading.verdicts import Verdict
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ def grade(
     db_url: str | None = None,
     trusted: bool = False,
     progress: Callable[[int, int, str], None] = lambda done, total, name: None,
+    due: Path | None = None,
 ) -> list[Verdict]:
     """Grade `submitted/{student}/{assignment}/{assignment}.ipynb` into `out`.
 
@@ -54,11 +56,13 @@ def grade(
       db_url: nbgrader's gradebook, `sqlite:///out/gradebook.db` by default.
       trusted: no sandbox. For one's own code only.
       progress: called with (done, total, "student/assignment") after each submission.
+      due: due dates, see `grading.deadlines`; by default those in `submitted`, which `course collect` puts there.
 
     Returns: the verdicts of this run, sorted by student and assignment.
     Raises: GradingError if there is nothing to grade; sandbox.SandboxUnavailable if no sandbox can be had.
     """
     tasks = _tasks(submitted)
+    rules = _deadlines(submitted, due)
     wanted = {assignment for _, assignment, _ in tasks} & judge.assignments()
     with ThreadPoolExecutor(1) as early:  # freezing the checks takes a second or two, in which the sandbox is tried
         for name in wanted:
@@ -68,11 +72,25 @@ def grade(
     out.mkdir(parents=True, exist_ok=True)
     judging = _on_dask(tasks, scheduler, timeout) if scheduler else _here(tasks, jobs, timeout, trusted)
     with _one_run_at_a_time(out), judging as judged:
-        return _write_all(tasks, judged, out, db_url, progress)
+        return _write_all(tasks, judged, out, db_url, progress, rules)
+
+
+def _deadlines(submitted: Path, due: Path | None) -> Deadlines:
+    default = submitted / deadlines.FILE
+    path = due or (default if default.is_file() else None)
+    try:
+        return deadlines.load(path, judge.assignments()) if path else Deadlines()
+    except deadlines.DeadlineError as error:
+        raise GradingError(str(error)) from None
 
 
 def _write_all(
-    tasks: list[Task], judged: Iterator[Judged], out: Path, db_url: str | None, progress: Callable[[int, int, str], None]
+    tasks: list[Task],
+    judged: Iterator[Judged],
+    out: Path,
+    db_url: str | None,
+    progress: Callable[[int, int, str], None],
+    rules: Deadlines,
 ) -> list[Verdict]:
     """Write everything down, as the verdicts come in."""
     from autograder.reporting import (  # nbgrader takes seconds to import, in which the first submissions are judged
@@ -82,12 +100,14 @@ def _write_all(
 
     releases = {page.assignment: assemble.for_learners(page) for page in chapter.all_chapters()}
     gradebook.write_course(out, releases, db_url)
+    folders = {(student, assignment): folder for student, assignment, folder in tasks}
     results = []
     with gradebook.GradebookWriter(db_url or f"sqlite:///{(out / 'gradebook.db').resolve()}") as book:
         for name in {assignment for _, assignment, _ in tasks} & releases.keys():
-            _register(book, name, releases[name])
+            _register(book, name, releases[name], rules)
         for verdict, notebook in judged:
-            results.append(_write(verdict, notebook, out, book, releases))
+            handed_in, verdict = _handed_in(verdict, folders, rules)
+            results.append(_write(verdict, notebook, out, book, releases, handed_in))
             progress(len(results), len(tasks), f"{verdict.student}/{verdict.assignment}")
         try:
             exports.write_all(out, book, results)
@@ -143,9 +163,21 @@ def _tasks(submitted: Path) -> list[Task]:
     return tasks
 
 
-def _register(book: GradebookWriter, assignment: str, released: NotebookNode) -> None:
+def _handed_in(verdict: Verdict, folders: dict[tuple[str, str], Path], rules: Deadlines) -> tuple[HandedIn, Verdict]:
+    """When a submission came in; where nobody can tell, the verdict gets a flag."""
+    folder = folders.get((verdict.student, verdict.assignment))
+    if folder is None:
+        return HandedIn(), verdict
     try:
-        book.register(assignment, released)
+        return deadlines.handed_in(folder, verdict.student, verdict.assignment, rules), verdict
+    except ValueError as error:
+        return HandedIn(), replace(verdict, flags=(f"no_time: {error}", *verdict.flags))
+
+
+def _register(book: GradebookWriter, assignment: str, released: NotebookNode, rules: Deadlines) -> None:
+    rule = rules.rules.get(assignment)
+    try:
+        book.register(assignment, released, rule.due if rule else None)
     except ValueError as error:  # a cell that was withdrawn holds a score given by hand
         raise GradingError(f"{assignment}: {error}") from None
 
@@ -185,14 +217,19 @@ def _on_dask(tasks: list[Task], scheduler: str, timeout: float) -> Iterator[Iter
 
 
 def _write(
-    verdict: Verdict, notebook: NotebookNode | None, out: Path, book: GradebookWriter, releases: dict[str, NotebookNode]
+    verdict: Verdict,
+    notebook: NotebookNode | None,
+    out: Path,
+    book: GradebookWriter,
+    releases: dict[str, NotebookNode],
+    handed_in: HandedIn,
 ) -> Verdict:
     """Gradebook first, then the notebook that formgrader shows, then the verdict, which says that the rest is done."""
     from autograder.reporting import gradebook
 
     if verdict.assignment in releases:
         previous = gradebook.read_autograded(out, verdict.student, verdict.assignment)
-        book.record(verdict, notebook, previous)
+        book.record(verdict, notebook, previous, handed_in)
         gradebook.write_autograded(out, releases[verdict.assignment], notebook, verdict)
         given, maximum = book.manual_scores(verdict.student, verdict.assignment)
         verdict = replace(verdict, manual_score=given, manual_max_score=maximum)

@@ -1,9 +1,10 @@
 """nbgrader's gradebook: the single writer of automatic scores, and the course folder that formgrader opens.
 
-nbgrader's own tables and models (0.9.6) are used as they are; only the transactions are ours. Its API commits after every row, so
-that a kill leaves half a submission; here each submission is one transaction, and so is the creation of the database. What
-teachers type (manual scores, extra credit, comments, names, due dates) is never written. SQLite runs with a write-ahead log, in
-which readers such as formgrader never block the writer; the log needs a local disk. Other databases work by their SQLAlchemy URL.
+nbgrader's own tables and models (0.9.6) are used as they are; only the transactions are ours. Its API commits after every row,
+so that a kill leaves half a submission; here each submission is one transaction, and so is the creation of the database. What
+teachers type (manual scores, extra credit, comments, names) is never written, due dates and penalties only from a file of them.
+SQLite runs with a write-ahead log, in which readers such as formgrader never block the writer; the log needs a local disk.
+Other databases work by their SQLAlchemy URL.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +42,7 @@ from nbgrader.dbutil import ALEMBIC_DIR
 from sqlalchemy import URL, and_, create_engine, delete, event, func, inspect, make_url, select, text, true
 from sqlalchemy.orm import Session, aliased
 
+from autograder.grading.deadlines import HandedIn
 from autograder.grading.verdicts import Item, Verdict, plain_name, write_atomically
 from autograder.reporting import passive
 
@@ -166,15 +169,17 @@ class GradebookWriter:
         with Session(self._engine) as db, db.begin():
             yield db
 
-    def register(self, assignment: str, release: NotebookNode) -> None:
+    def register(self, assignment: str, release: NotebookNode, due: datetime | None = None) -> None:
         """Make the database's assignment agree with `release`, the notebook handed out, whose metadata names cells and points.
 
-        Calling it again changes nothing; with other points it updates them, with other cells it adds and removes.
+        Calling it again changes nothing; with other points it updates them, with other cells it adds and removes. Without `due` the
+        due date that a teacher gave stays.
         Raises: ValueError, and changes nothing, if a cell that went away holds a score or comment given by hand.
         """
         cells = graded_cells(release)
         with self._transaction() as db:
             row = _get_or_add(db, Assignment, name=plain_name(assignment))
+            row.duedate = _utc(due) or row.duedate
             db.flush()
             notebook = _get_or_add(db, Notebook, name=assignment, assignment_id=row.id)
             notebook.kernelspec = json.dumps(release.metadata.get("kernelspec", {}), sort_keys=True)
@@ -207,12 +212,19 @@ class GradebookWriter:
                     db.execute(delete(Comment).filter_by(cell_id=old.id))
                 db.delete(old)
 
-    def record(self, verdict: Verdict, submitted: NotebookNode | None = None, previous: NotebookNode | None = None) -> bool:
+    def record(
+        self,
+        verdict: Verdict,
+        submitted: NotebookNode | None = None,
+        previous: NotebookNode | None = None,
+        handed_in: HandedIn = HandedIn(),  # noqa: B008
+    ) -> bool:
         """Write the automatic scores of a verdict, in one transaction. Returns whether the verdict is one that may be written.
 
         `needs_review` and `infra_error` are not, nor is the `student_error` of an unknown assignment; that of a known one is zero
         everywhere. An open question needs a teacher until it has a score by hand, and again when its answer in `submitted`
         differs from the one in `previous` (see `read_autograded`). Left as released it is worth 0 without one, as in nbgrader.
+        `handed_in` says when it came in, and what part of all its points, those given by hand included, being late costs.
 
         Raises: ValueError if the assignment is not registered, or the verdict lacks one of its exercises.
         """
@@ -247,6 +259,7 @@ class GradebookWriter:
                     _grade_exercise(grade, scores[name])
                 else:
                     raise ValueError(f"{verdict.student}/{verdict.assignment}: the verdict has no item for {name!r}")
+            _note_time(db, paper, handed_in)
         return True
 
     @staticmethod
@@ -356,6 +369,22 @@ class GradebookWriter:
             score = None if score is None else score + (extra or 0.0)
             marks.setdefault((student, assignment), []).append(Mark(cell, question is not None, score, points))
         return marks
+
+
+def _utc(moment: datetime | None) -> datetime | None:
+    """A time as nbgrader keeps it."""
+    return moment.astimezone(UTC).replace(tzinfo=None) if moment else None
+
+
+def _note_time(db: Session, paper: SubmittedNotebook, handed_in: HandedIn) -> None:
+    submission = paper.assignment
+    submission.timestamp = _utc(handed_in.at) or submission.timestamp
+    if not handed_in.ruled:
+        return
+    submission.extension = handed_in.extension
+    db.flush()
+    points = db.scalar(select(SubmittedNotebook.score).where(SubmittedNotebook.id == paper.id)) or 0.0
+    paper.late_submission_penalty = round(points * handed_in.share, 4) or None
 
 
 def _grade_exercise(grade: Grade, score: float) -> None:

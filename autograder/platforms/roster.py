@@ -1,0 +1,147 @@
+"""Who is who: a table from a platform's ids, logins or names to the students' folders, and names that can name a folder."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import os
+import re
+import unicodedata
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from autograder.grading.verdicts import clean_text, plain_name
+
+COLUMNS = {
+    "student": "student",
+    "student id": "student",
+    "student_id": "student",
+    "id": "id",
+    "platform id": "id",
+    "platform_id": "id",
+    "user id": "id",
+    "participant": "id",
+    "login": "login",
+    "username": "login",
+    "github_username": "login",
+    "email": "email",
+    "email address": "email",
+    "name": "name",
+    "full name": "name",
+    "submitted_at": "submitted_at",
+}
+KEYS = ("id", "login", "email", "name")
+MAX_BYTES = 16 << 20
+
+
+class RosterError(ValueError):
+    """The table can't be used; the message names file, line and cure."""
+
+
+def label(text: str) -> str:
+    """`text` as the name of a student's folder, NFC; what cannot be one keeps what can be read of it, and a hash."""
+    text = unicodedata.normalize("NFC", text).strip()
+    try:
+        return plain_name(text)
+    except ValueError:
+        readable = re.sub(r"[\s/\\]+", "_", clean_text(text, 100)).lstrip(".") or "student"
+        digest = hashlib.sha256(os.fsencode(text) if text.isprintable() else text.encode(errors="surrogatepass")).hexdigest()
+        return f"{readable}-{digest[:8]}"
+
+
+def _key(value: str) -> str:
+    return " ".join(unicodedata.normalize("NFC", value).split()).casefold()
+
+
+@dataclass
+class Roster:
+    """(kind, value) → student, and the times at which students handed in, where the platform's download does not tell them."""
+
+    students: dict[tuple[str, str], str] = field(default_factory=dict)
+    times: dict[str, str] = field(default_factory=dict)
+
+    def student(self, **known: str | None) -> str | None:
+        """The student with the first of these: id, login, email, name. An id may also stand where a login is asked for, and so on."""
+        for kind in KEYS:
+            value = known.get(kind)
+            if value and (found := self.students.get((kind, _key(value)))):
+                return found
+        return None
+
+
+def load(path: Path) -> Roster:
+    """Read `names.csv`: a column `student`, one or more of `id`, `login`, `email`, `name`, perhaps `submitted_at`.
+
+    Canvas's gradebook, Moodle's grading worksheet and a GitHub Classroom roster are understood as they are exported.
+    Raises: RosterError.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise RosterError(f"{path}: {error.strerror}; --names wants a CSV file") from None
+    try:
+        text = content[:MAX_BYTES].decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise RosterError(f"{path}: is not UTF-8 text; export it as CSV, UTF-8") from None
+    first = text.partition("\n")[0]
+    delimiter = max(",;\t", key=first.count)
+    rows = list(csv.reader(io.StringIO(text), delimiter=delimiter))
+    if not rows:
+        raise RosterError(f"{path}: is empty; its first line names the columns: student and one of {', '.join(KEYS)}")
+    kinds = _kinds(rows[0])
+    if "student" not in kinds or not set(kinds) & set(KEYS):
+        raise RosterError(
+            f"{path}, line 1: the columns are {', '.join(rows[0]) or 'none'}; wanted are student and one of {', '.join(KEYS)}"
+        )
+    return _filled(path, kinds, rows)
+
+
+def _kinds(header: list[str]) -> list[str | None]:
+    """What each column means."""
+    names = [_key(name) for name in header]
+    if {"id", "sis login id"} <= set(names):  # Canvas's gradebook, whose column "Student" is a name
+        canvas = {"student": "name", "id": "id", "sis login id": "student"}
+        return [canvas.get(name) for name in names]
+    if "github_username" in names and "identifier" in names:
+        classroom = {"identifier": "student", "github_username": "login"}
+        return [classroom.get(name) for name in names]
+    if "identifier" in names and "full name" in names:  # Moodle's grading worksheet
+        moodle = {"identifier": "id", "full name": "name"}
+        who = next((name for name in ("username", "id number", "email address") if name in names), "full name")
+        return ["student" if name == who else moodle.get(name) for name in names]
+    return [COLUMNS.get(name) for name in names]
+
+
+def _filled(path: Path, kinds: list[str | None], rows: list[list[str]]) -> Roster:
+    roster = Roster()
+    lines: dict[tuple[str, str], int] = {}
+    repeated = set()
+    for number, row in enumerate(rows[1:], start=2):
+        values = {kind: value.strip() for kind, value in zip(kinds, row, strict=False) if kind and value.strip()}
+        if not values or row[0].strip() == "Points Possible":
+            continue
+        if "student" not in values:
+            if any(kind in values for kind in ("login", "email")) or ("id" in values and "name" not in values):
+                raise RosterError(f"{path}, line {number}: no student in it; fill in the column, or delete the line")
+            continue  # a test student of Canvas has no login
+        student = label(values["student"])
+        if "submitted_at" in values:
+            roster.times[student] = values["submitted_at"]
+        for kind in KEYS:
+            if kind not in values:
+                continue
+            value = re.sub(r"(?i)^participant ", "", values[kind]) if kind == "id" else values[kind]
+            key = (kind, _key(value))
+            if roster.students.setdefault(key, student) != student:
+                if kind == "name":  # two people of one name: that tells nothing about either
+                    repeated.add(key)
+                    continue
+                raise RosterError(
+                    f"{path}, line {number}: the {kind} {value} is {student}'s here and {roster.students[key]}'s in line {lines[key]}; "
+                    "delete one of the two"
+                )
+            lines.setdefault(key, number)
+    for key in repeated:
+        del roster.students[key]
+    return roster
