@@ -228,7 +228,8 @@ def _result(verdict: Verdict, marks: list[Mark], row: Mapping[str, Any], handed:
     person = Person(name or verdict.student, verdict.student, row["lms_user_id"])
     if handed:
         digits = handed.platform_id if handed.platform == "canvas" and (handed.platform_id or "").isdecimal() else None
-        person = Person(name or handed.name or verdict.student, handed.login or verdict.student, row["lms_user_id"] or digits)
+        login = handed.login or ("" if digits else verdict.student)  # Canvas's downloads show a name there, and no login
+        person = Person(name or handed.name or verdict.student, login, row["lms_user_id"] or digits)
     given = [mark.score for mark in marks if mark.question]
     total = None if None in given or not given else sum(score for score in given if score is not None)
     return Result(

@@ -75,7 +75,7 @@ def _made(results: Iterable[Result], automatic_only: bool) -> str:
     rows = []
     for result in results:
         got, most = result.total(automatic_only)
-        grades = (f"{got:.2f}", f"{most:.2f}", "Yes", "", "-")
+        grades = (f"{got:.2f}", f"{most:.2f}", "Yes", "", "")
         rows.append((f"Participant {_number(result)}", _name(result), "", "", *grades, MARK + result.summary(automatic_only)))
     return csv_text(COLUMNS, rows)
 

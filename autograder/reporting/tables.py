@@ -161,7 +161,7 @@ def _canvas_login(person: Person) -> str:
 def canvas_finds(person: Person) -> bool:
     """Whether Canvas's import can find a student: by ID, or by a login that survives the file and Canvas's way with numbers."""
     login = cell(_canvas_login(person))
-    return bool(person.identity) or (login == person.login and _as_canvas_reads(login) == person.login)
+    return bool(person.identity) or bool(login and login == person.login and _as_canvas_reads(login) == person.login)
 
 
 def _as_canvas_reads(field: str) -> str:
