@@ -177,7 +177,10 @@ def load(grades: Path, submitted: Path | None, db_url: str | None = None, only: 
         verdicts = read_all(grades / "verdicts")
     except ValueError as error:
         raise GiveBackError(str(error)) from None
-    if not verdicts or not (db_url or (grades / "gradebook.db").is_file()):
+    database = Path(db_url.removeprefix("sqlite:///")) if db_url and db_url.startswith("sqlite:///") else grades / "gradebook.db"
+    if db_url and db_url.startswith("sqlite:///") and not database.is_file():
+        raise GiveBackError(f"--db-url: there is no gradebook {database}; name the one that `course grade` wrote")
+    if not verdicts or not (db_url or database.is_file()):
         raise GiveBackError(
             f"{grades}: nothing was graded into this folder. Run `course grade` first, or name its folder with --out."
         )

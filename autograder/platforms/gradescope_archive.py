@@ -29,7 +29,6 @@ python3 -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13) 
 python3 -m venv "$root/venv"
 "$root/venv/bin/pip" install --no-cache-dir -r "$root/source/requirements.txt"
 "$root/venv/bin/pip" install --no-cache-dir --no-deps -e "$root/source"
-chmod -R go-rwx "$root/source/autograder" "$root/source/solutions"
 """
 
 _RUN = """\

@@ -8,7 +8,7 @@ from pathlib import Path
 from autograder.grading import judge
 from autograder.grading.verdicts import write_atomically
 from autograder.platforms import classroom50, give_back_canvas, give_back_moodle, give_back_nbgrader, gradescope_archive
-from autograder.platforms.give_back import GiveBackError, Given, Result, load
+from autograder.platforms.give_back import GiveBackError, Given, Result, load, read_collected
 from autograder.reporting.machines import gradescope_json
 
 WITH_WORKSHEET = ("canvas", "moodle")
@@ -51,18 +51,19 @@ def give_back(platform: str, request: Request) -> Given:
 
 def _gradescope(request: Request, into: Path) -> Given:
     """An archive for Gradescope's container for each assignment, and the results of what was collected from Gradescope."""
-    graded = (request.grades / "verdicts").is_dir()
-    results: list[Result] = []
-    given = Given()
     unknown = sorted(set(request.only) - judge.assignments())
     if unknown:
         raise GiveBackError(f"no such assignment: {', '.join(unknown)}; there are {', '.join(sorted(judge.assignments()))}")
-    if graded:
+    handed = read_collected(request.submitted or Path("submitted"))
+    ours = {key for key, one in handed.items() if one.platform == "gradescope" and (not request.only or key[1] in request.only)}
+    results: list[Result] = []
+    given = Given()
+    if ours and (request.grades / "verdicts").is_dir():
         results, given = load(request.grades, request.submitted, request.db_url)
-        if request.only:
-            results = [result for result in results if result.assignment in request.only]
-            given.left_out = [line for line in given.left_out if line.split(":")[0].split(" ")[-1] in request.only]
-    assignments = request.only or tuple(sorted({result.assignment for result in results}))
+        results = [result for result in results if (result.student, result.assignment) in ours]
+        given.left_out = [line for line in given.left_out if line.partition(": ")[0] in {" ".join(key) for key in ours}]
+    graded = {path.stem for path in (request.grades / "verdicts").glob("*/*.json")} & judge.assignments()
+    assignments = request.only or tuple(sorted(graded))
     if not assignments:
         raise GiveBackError("which assignment is the archive to grade? Say it, as in --only ch44")
     for name in assignments:

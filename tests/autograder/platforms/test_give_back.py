@@ -137,6 +137,7 @@ def test_a_damaged_list_of_who_is_who_is_refused(canvas, content, says):
         (["--submitted", "nowhere"], "nowhere: no such folder"),
         (["--only", "ch99"], "nothing of ch99 was graded"),
         (["--to", "nbgrader", "--worksheet", "x.csv"], "nbgrader has no worksheet"),
+        (["--db-url", "sqlite:///nowhere.db"], "there is no gradebook nowhere.db"),
         (["--automatic"], "--automatic is for Moodle"),
         (["--worksheet", "nowhere.csv"], "nowhere.csv: cannot be read"),
     ],

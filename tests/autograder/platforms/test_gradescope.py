@@ -17,6 +17,7 @@ from autograder.grading.verdicts import Verdict
 from autograder.platforms import gradescope_archive, gradescope_container, returning
 from autograder.platforms.give_back import GiveBackError
 from tests.attacks import toolbox
+from tests.autograder.platforms.test_give_back import Class
 
 
 def unpacked(folder: Path, **options: bool) -> Path:
@@ -30,6 +31,7 @@ def unpacked(folder: Path, **options: bool) -> Path:
     (root / "run_autograder").chmod(0o755)
     for name in ("submission", "results"):
         (root / name).mkdir()
+    subprocess.run(["bash", "-n", str(root / "source" / "setup.sh")], check=True)
     return root
 
 
@@ -108,3 +110,15 @@ def test_the_archive_is_made_before_anybody_has_handed_in(tmp_path):
         returning.give_back("gradescope", returning.Request(tmp_path / "grades", only=("ch99",)))
     with pytest.raises(GiveBackError, match="as in --only ch44"):
         returning.give_back("gradescope", returning.Request(tmp_path / "grades"))
+
+
+@pytest.mark.parametrize("platform, left_out", [("gradescope", ["rev ch44"]), ("canvas", [])])
+def test_what_came_from_gradescope_gets_its_results_by_number(tmp_path, platform, left_out):
+    folder = Class(tmp_path, platform)
+    folder.add("ada", "111", by_hand=1.5)
+    folder.add("rev", "112", status="needs_review")
+    given = returning.give_back("gradescope", returning.Request(folder.out, folder.submitted))
+    names = ["ch44-autograder.zip", "submission_111.json"] if left_out else ["ch44-autograder.zip"]
+    assert [path.name for path in given.files] == names and [line.split(":")[0] for line in given.left_out] == left_out
+    if left_out:
+        assert json.loads(given.files[1].read_text())["score"] == 6.5
