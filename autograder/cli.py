@@ -255,7 +255,7 @@ def give_back(
     out: Annotated[Path, typer.Option(help="The folder that `course grade` wrote.")] = Path("grades"),
     submitted: Annotated[
         Path | None,
-        typer.Option(help="The folder that was graded: `course collect` wrote there who is who. submitted/ by default."),
+        typer.Option(help="The folder that was graded, where `course collect` says who is who; by default what OUT was made of."),
     ] = None,
     worksheet: Annotated[
         Path | None, typer.Option(help="Moodle's grading worksheet, or the gradebook as Canvas exports it: is filled in.")

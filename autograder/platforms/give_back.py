@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from autograder.grading import sources
 from autograder.grading.verdicts import FINAL, Verdict, clean_text, plain_name, read_all
 from autograder.reporting.gradebook import GradebookWriter, Mark
 from autograder.reporting.report import STATE_WORDS, points
@@ -119,12 +120,29 @@ class Given:
         self.left_out.append(f"{result.student} {result.assignment}: {why}")
 
 
-def read_collected(submitted: Path) -> dict[tuple[str, str], Handed]:
-    """(student, assignment) → how it came in, from `submitted/.collected.json`; empty if there is no such file.
+def graded_from(grades: Path, submitted: Path | None) -> list[Path]:
+    """The folders of submissions that were graded into `grades`, the last one last; or `submitted` alone, if it is given.
+
+    Raises: GiveBackError if that is no folder."""
+    if submitted is None:
+        return [path for path in sources.read(grades) if path.is_dir()]
+    if not submitted.is_dir():
+        raise GiveBackError(f"{submitted}: no such folder. Give the folder that was graded, or leave --submitted out.")
+    return [submitted]
+
+
+def read_collected(folders: Iterable[Path]) -> dict[tuple[str, str], Handed]:
+    """(student, assignment) → how it came in, from each folder's `.collected.json`, where there is one; the last counts.
 
     Raises: GiveBackError that names file, entry and cure.
     """
-    path = submitted / COLLECTED
+    handed: dict[tuple[str, str], Handed] = {}
+    for folder in folders:
+        handed |= _read_collected(folder / COLLECTED)
+    return handed
+
+
+def _read_collected(path: Path) -> dict[tuple[str, str], Handed]:
     if not path.exists():
         return {}
     cure = "collect again (`course collect`), or delete the file to give back without it"
@@ -170,9 +188,7 @@ def load(grades: Path, submitted: Path | None, db_url: str | None = None, only: 
 
     Raises: GiveBackError if nothing was graded there, or an assignment of `only` was not.
     """
-    if submitted is not None and not submitted.is_dir():
-        raise GiveBackError(f"{submitted}: no such folder. Give the folder that was graded, or leave --submitted out.")
-    handed = read_collected(submitted or Path("submitted"))
+    handed = read_collected(graded_from(grades, submitted))
     try:
         verdicts = read_all(grades / "verdicts")
     except ValueError as error:

@@ -6,6 +6,7 @@ are copied from the submission's folder, where the exchange put them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from autograder.grading.verdicts import write_atomically
@@ -16,7 +17,7 @@ RECEIPTS = ("timestamp.txt", "submission_secret.txt")
 _MAX_BYTES = 4096
 
 
-def write(results: list[Result], into: Path, given: Given, submitted: Path) -> None:
+def write(results: list[Result], into: Path, given: Given, submitted: Sequence[Path]) -> None:
     """Write the reports of the verdicts, with points by hand as they are now, into nbgrader's layout."""
     lacking = []
     for result in results:
@@ -24,9 +25,10 @@ def write(results: list[Result], into: Path, given: Given, submitted: Path) -> N
         page = report_html(result.verdict, result.marks)
         given.files.append(write_atomically(folder / f"{result.assignment}.html", page))
         for name in RECEIPTS:
-            receipt = submitted / result.student / result.assignment / name
-            if receipt.is_file() and not receipt.is_symlink() and receipt.stat().st_size <= _MAX_BYTES:
-                given.files.append(write_atomically(folder / name, receipt.read_bytes()))
+            places = [one / result.student / result.assignment / name for one in submitted]
+            fitting = [one for one in places if one.is_file() and not one.is_symlink() and one.stat().st_size <= _MAX_BYTES]
+            if fitting:
+                given.files.append(write_atomically(folder / name, fitting[-1].read_bytes()))
             elif not (folder / name).is_file():
                 lacking.append(f"{result.student} {result.assignment}")
     if lacking:

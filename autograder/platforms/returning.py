@@ -8,7 +8,7 @@ from pathlib import Path
 from autograder.grading import judge
 from autograder.grading.verdicts import write_atomically
 from autograder.platforms import classroom50, give_back_canvas, give_back_moodle, give_back_nbgrader, gradescope_archive
-from autograder.platforms.give_back import GiveBackError, Given, Result, load, read_collected
+from autograder.platforms.give_back import GiveBackError, Given, Result, graded_from, load, read_collected
 from autograder.reporting.machines import gradescope_json
 
 WITH_WORKSHEET = ("canvas", "moodle")
@@ -43,7 +43,7 @@ def give_back(platform: str, request: Request) -> Given:
     elif platform == "moodle":
         give_back_moodle.write(results, into, given, request.worksheet, request.automatic)
     elif platform == "nbgrader":
-        give_back_nbgrader.write(results, into, given, request.submitted or Path("submitted"))
+        give_back_nbgrader.write(results, into, given, graded_from(request.grades, request.submitted))
     else:
         classroom50.write(results, into, given)
     return given
@@ -54,8 +54,10 @@ def _gradescope(request: Request, into: Path) -> Given:
     unknown = sorted(set(request.only) - judge.assignments())
     if unknown:
         raise GiveBackError(f"no such assignment: {', '.join(unknown)}; there are {', '.join(sorted(judge.assignments()))}")
-    handed = read_collected(request.submitted or Path("submitted"))
-    ours = {key for key, one in handed.items() if one.platform == "gradescope" and (not request.only or key[1] in request.only)}
+    collected = read_collected(graded_from(request.grades, request.submitted))
+    ours = {
+        key for key, one in collected.items() if one.platform == "gradescope" and (not request.only or key[1] in request.only)
+    }
     results: list[Result] = []
     given = Given()
     if ours and (request.grades / "verdicts").is_dir():

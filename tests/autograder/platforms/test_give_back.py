@@ -12,7 +12,7 @@ from nbgrader.api import Gradebook, Student
 from typer.testing import CliRunner
 
 from autograder import cli
-from autograder.grading import verdicts
+from autograder.grading import sources, verdicts
 from autograder.platforms import give_back, give_back_sheets
 from autograder.reporting.gradebook import GradebookWriter
 
@@ -110,6 +110,17 @@ def test_collected_but_not_graded_is_named(canvas):
     (canvas.submitted / ".collected.json").write_text(json.dumps({"schema": 1, "entries": canvas.entries}))
     done = canvas.give_back()
     assert done.exit_code == 4 and "bob ch44: collected, but not graded yet" in done.output
+
+
+def test_who_is_who_is_read_from_the_folders_that_were_graded(canvas, tmp_path):
+    canvas.add("ada", "101", by_hand=2.0)
+    sources.remember(canvas.out, tmp_path / "gone")
+    sources.remember(canvas.out, canvas.submitted)
+    results, _ = give_back.load(canvas.out, None)
+    assert [result.person.identity for result in results] == ["101"]
+    (canvas.out / sources.FILE).unlink()
+    results, _ = give_back.load(canvas.out, None)  # a folder that happens to be called submitted says nothing of these grades
+    assert [result.person.identity for result in results] == [None]
 
 
 @pytest.mark.parametrize(
