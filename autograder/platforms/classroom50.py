@@ -59,7 +59,10 @@ def result_json(result: Result, environment: Mapping[str, str], now: datetime) -
 def write(results: list[Result], into: Path, given: Given) -> None:
     """Write `into/result.json` for a single submission on Classroom 50's runner, else `into/classroom50/STUDENT/ASSIGNMENT/result.json`."""
     now = datetime.now(UTC)
-    runner = bool(os.environ.get("SUBMISSION_TAG"))
+    if runner := bool(os.environ.get("SUBMISSION_TAG")):
+        (into / "result.json").unlink(
+            missing_ok=True
+        )  # one that was handed in, or is of an earlier run, says nothing of this one
     if runner and len(results) == 1:
         given.files.append(write_atomically(into / "result.json", result_json(results[0], os.environ, now)))
         return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,8 +36,13 @@ def give_back(platform: str, request: Request) -> Given:
     if request.automatic and platform != "moodle":
         raise GiveBackError("--automatic is for Moodle: the other platforms get points by hand separately")
     into = request.into or (request.grades if platform == "nbgrader" else request.grades / "return")
-    if platform == "gradescope":
-        return _gradescope(request, into)
+    given = _gradescope(request, into) if platform == "gradescope" else _others(platform, request, into)
+    if request.worksheet is None:
+        _forget(into, platform, given.files, request.only)
+    return given
+
+
+def _others(platform: str, request: Request, into: Path) -> Given:
     results, given = load(request.grades, request.submitted, request.db_url, request.only)
     if platform == "canvas":
         give_back_canvas.write(results, into, given, request.worksheet)
@@ -47,6 +53,21 @@ def give_back(platform: str, request: Request) -> Given:
     else:
         classroom50.write(results, into, given)
     return given
+
+
+def _forget(into: Path, platform: str, files: list[Path], only: tuple[str, ...]) -> None:
+    """Remove what an earlier run wrote and this one did not: it would be a stale score. Nothing else is touched."""
+    note = into / f".returned-{platform}"
+    now = {path.relative_to(into).as_posix() for path in files}
+    before = set(note.read_text(encoding="utf-8").split("\n")) - {""} if note.is_file() else set()
+    others = judge.assignments() - {*only} if only else set()
+    kept = {name for name in before - now if others & set(re.split("[/ .-]", name))}
+    for name in before - now - kept:
+        path = into / name
+        if path.resolve().is_relative_to(into.resolve()):
+            path.unlink(missing_ok=True)
+    if now or before:
+        write_atomically(note, "".join(f"{name}\n" for name in sorted(now | kept)))
 
 
 def _gradescope(request: Request, into: Path) -> Given:

@@ -104,6 +104,29 @@ def test_what_is_not_final_is_left_out_by_name(tmp_path, platform, status, why):
     assert written and not any("rev" in path.parts or b"rev" in path.read_bytes() for path in written if path.suffix != ".zip")
 
 
+@pytest.mark.parametrize("platform", ["canvas", "moodle", "nbgrader", "classroom50"])
+def test_no_score_of_an_earlier_run_is_left_lying(tmp_path, platform):
+    folder = Class(tmp_path, platform)
+    folder.add("ada", "101", by_hand=2.0)
+    assert folder.give_back("--into", tmp_path / "back").exit_code == 0
+    (tmp_path / "back" / "mine.txt").write_text("of the teacher's")
+    verdicts.write(folder.out / "verdicts", judged("ada", status="needs_review"))
+    assert folder.give_back("--into", tmp_path / "back", "--only", "ch44").exit_code == 4
+    left = {path.name for path in (tmp_path / "back").rglob("*") if path.is_file()}
+    assert left == {"mine.txt", f".returned-{platform}"}
+
+
+def test_another_assignments_files_are_kept_by_only(canvas, tmp_path):
+    canvas.book.register("ch45", release())
+    canvas.add("ada", "101", by_hand=2.0)
+    other = judged("ada", assignment="ch45")
+    canvas.book.record(other, submission())
+    verdicts.write(canvas.out / "verdicts", other)
+    canvas.give_back()
+    canvas.give_back("--only", "ch44")
+    assert {path.name for path in (canvas.out / "return" / "canvas").iterdir()} > {"ch44.csv", "ch45.csv", "ch45 questions.csv"}
+
+
 def test_collected_but_not_graded_is_named(canvas):
     canvas.add("ada", "101", by_hand=2.0)
     canvas.entries.append({**canvas.entries[0], "student": "bob"})
@@ -385,7 +408,11 @@ def test_on_classroom50s_runner_the_file_is_whole(tmp_path, monkeypatch):
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     folder = Class(tmp_path, "classroom50")
-    folder.add("ada", None)
+    folder.add("ada", None, status="needs_review")
+    (tmp_path / "result.json").write_text("handed in")
+    assert folder.give_back("--into", tmp_path).exit_code == 4 and not (tmp_path / "result.json").exists()
+    folder.add("ada", None, status="graded")
+    folder.submitted.joinpath(".collected.json").unlink()
     assert folder.give_back("--into", tmp_path).exit_code == 0
     content = json.loads((tmp_path / "result.json").read_text())
     assert set(content) == {
