@@ -186,6 +186,34 @@ def collect(
 
 
 @app.command()
+def similar(
+    submitted: Annotated[Path, typer.Argument(help="The folder that holds STUDENT/ASSIGNMENT/ASSIGNMENT.ipynb.")],
+    assignment: Annotated[str | None, typer.Option(help="Of this assignment only, as in ch44.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Also write the list as a CSV, with the shared passages.")] = None,
+    at_least: Annotated[float, typer.Option(min=0.05, max=1.0, help="List pairs that are so much alike.")] = 0.6,
+) -> None:
+    """List pairs of submissions that are alike beyond the release and the known right answers: a list to look at, not a verdict."""
+    from autograder.platforms import similar
+
+    try:
+        pairs, problems = similar.find(submitted, assignment, at_least)
+        if out:
+            similar.write(out, pairs)
+    except similar.SimilarError as error:
+        _stop(error)
+    except OSError as error:
+        _stop(f"--out {out}: {error.strerror}")
+    print(similar.NOT_A_VERDICT)
+    if pairs:
+        Console(highlight=False).print(similar.table(pairs))
+    print(similar.summary(pairs, at_least), flush=True)
+    for line in problems:
+        err.print(f"course: {line}", markup=False)
+    if problems:
+        raise typer.Exit(LEFT_OVER)
+
+
+@app.command()
 def grade(
     submitted: Annotated[Path, typer.Argument(help="The folder that holds STUDENT/ASSIGNMENT/ASSIGNMENT.ipynb.")],
     out: Annotated[Path, typer.Option(help="Where verdicts, tables, reports and the gradebook go.")] = Path("grades"),

@@ -24,6 +24,7 @@ MAX_FILE = 256 << 20  # bytes of one file
 MAX_ENTRIES = 100_000  # files and folders of one download
 MAX_DIRECTORY = 64 << 20  # bytes of a zip's table of contents, which is read whole
 MAX_DEPTH = 20
+MAX_TOLD = 20  # refusals of one archive that get a line each
 BOMB_BYTES, BOMB_RATIO = 16 << 20, 200  # a larger file that shrinks to less than this share is one of nothing but repetition
 CHUNK = 1 << 20
 JUNK = {"__macosx", "thumbs.db", "desktop.ini", "__pycache__"}
@@ -133,8 +134,17 @@ def _opener(path: Path) -> Callable[[], IO[bytes]]:
     return opened
 
 
-def of_zip(opened: Callable[[], IO[bytes]], name: str, stack: ExitStack, problems: list[str]) -> list[Entry]:
-    """The files of a zip that lies in a seekable stream. Raises: Refused."""
+def of_zip(
+    opened: Callable[[], IO[bytes]],
+    name: str,
+    stack: ExitStack,
+    problems: list[str],
+    opener: Callable[[zipfile.ZipInfo], Callable[[], IO[bytes]]] | None = None,
+) -> list[Entry]:
+    """The files of a zip that lies in a seekable stream, which `stack` keeps open, unless there is an `opener` of its members.
+
+    Raises: Refused.
+    """
     stream = stack.enter_context(opened())
     _check_directory(stream)
     try:
@@ -143,6 +153,7 @@ def of_zip(opened: Callable[[], IO[bytes]], name: str, stack: ExitStack, problem
     except Exception as error:  # a damaged directory may break it in any way
         raise Refused(f"is no zip that can be read ({error})") from None
     found: dict[str, Entry] = {}
+    told = 0
     for member in members:
         try:
             path = _safe_path(member.filename)
@@ -150,11 +161,15 @@ def of_zip(opened: Callable[[], IO[bytes]], name: str, stack: ExitStack, problem
                 continue
             _check_member(member)
         except Refused as reason:
-            problems.append(f"{_shown(name)}: {_shown(member.filename)} {reason}")
+            told += 1
+            if told <= MAX_TOLD:
+                problems.append(f"{_shown(name)}: {_shown(member.filename)} {reason}")
             continue
         if path in found:
             problems.append(f"{_shown(name)}: {_shown(path)} is in it twice; the last one counts")
-        found[path] = Entry(path, member.file_size, _member_opener(archive, member))
+        found[path] = Entry(path, member.file_size, opener(member) if opener else _member_opener(archive, member))
+    if told > MAX_TOLD:
+        problems.append(f"{_shown(name)}: {told - MAX_TOLD} more of its files are refused")
     return list(found.values())
 
 
@@ -226,8 +241,13 @@ def _shown(name: str) -> str:
 
 
 def nested(entry: Entry, stack: ExitStack, problems: list[str]) -> list[Entry]:
-    """The files of a zip inside a download; zips in it stay closed. Raises: Refused."""
-    spool = stack.enter_context(tempfile.TemporaryFile())  # noqa: SIM115
-    for piece in chunks(entry):
-        spool.write(piece)
-    return of_zip(lambda: spool, entry.path, stack, problems)
+    """The files of a zip inside a download; zips in it stay closed. Raises: Refused.
+
+    It is opened anew for each file: a class hands in more zips than a process may keep open.
+    """
+    path = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "inner.zip"
+    with open(path, "wb") as spool:
+        for piece in chunks(entry):
+            spool.write(piece)
+    with ExitStack() as own:
+        return of_zip(_opener(path), entry.path, own, problems, lambda member: lambda: zipfile.ZipFile(path).open(member))

@@ -48,6 +48,7 @@ class Attempt:
     download: str
     submitted_at: str | None
     order: int
+    told: bool = False  # `submitted_at` comes from --names, where it may be corrected
     sha256: str = ""
     score: float | None = None  # with `environment`, for --best: judged once
     environment: str | None = None
@@ -121,9 +122,12 @@ class Store:
         if known is None:
             self.attempts.setdefault(key, []).append(attempt)
             return True, problems
-        if ((known.submitted_at or "") < (attempt.submitted_at or "")) or known.order < attempt.order:  # handed in once more
+        later = attempt.at is not None and not attempt.told and (known.at is None or known.at < attempt.at)
+        if later or known.order < attempt.order:  # the same work, handed in once more
             known.submitted_at, known.order, known.download = attempt.submitted_at, attempt.order, attempt.download
             return True, problems
+        if attempt.told and attempt.order == known.order:
+            known.submitted_at, known.told = attempt.submitted_at, True
         return False, problems
 
     def put(self, key: Key, winner: Attempt, have: str | None) -> None:
@@ -139,12 +143,16 @@ class Store:
                     os.rename(current, kept)
             current.parent.mkdir(parents=True, exist_ok=True)
             os.rename(self.kept(key, winner.sha256), current)
-        if winner.at:
-            stamp = winner.at.astimezone(UTC)
-            write_atomically(current / deadlines.TIMESTAMP, f"{stamp:%Y-%m-%d %H:%M:%S.%f} UTC")
+        self.stamp(key, winner)
         kept = self.kept(key, winner.sha256)
         if kept.exists():  # from a run that was killed
             shutil.rmtree(kept)
+
+    def stamp(self, key: Key, winner: Attempt) -> None:
+        """Write down when the attempt that counts was handed in."""
+        if winner.at:
+            stamp = winner.at.astimezone(UTC)
+            write_atomically(self.current(key) / deadlines.TIMESTAMP, f"{stamp:%Y-%m-%d %H:%M:%S.%f} UTC")
 
     def tidy(self) -> None:
         """Remove folders that have become empty, and what a killed run left half copied."""

@@ -113,6 +113,8 @@ def collect(
             done.problems += found.problems
             done.notes += found.notes
             papers += _Sorting(known, assignment, people, rules, _students(into), stack, done).papers(found.handed, str(source))
+        if not papers:
+            raise CollectError(f"nothing was collected: {'; '.join(done.problems[:3])}")
         if dry_run:
             latest = {(one.attempt.student, one.attempt.assignment): one for one in papers}
             done.entries = [_entry(one.attempt, 1, rules, done, one.late) for _, one in sorted(latest.items())]
@@ -348,11 +350,13 @@ class _Sorting:
         return _artefacts_named(result, name)
 
     def _paper(self, one: Handed, student: str, name: str, files: dict[str, Entry]) -> Paper:
-        at = one.at
-        if at is None and self.people and (told := self.people.times.get(student)):
+        at, told = one.at, self.people.times.get(student) if self.people else None
+        if at is None and told:
             at = self._told(student, told)
-        stamp = at.isoformat() if at else None
-        attempt = Attempt(student, name, one.platform, one.platform_id, one.name, one.login, one.download, stamp, one.order)
+        stamp, by_names = at.isoformat() if at else None, at is not None and one.at is None
+        attempt = Attempt(
+            student, name, one.platform, one.platform_id, one.name, one.login, one.download, stamp, one.order, by_names
+        )
         return Paper(attempt, files, one.late)
 
     def _told(self, student: str, text: str) -> datetime | None:
@@ -460,6 +464,9 @@ def _lay_out(
         by_hand = have is not None and have not in {attempt.sha256 for attempt in every}
         if by_hand and key not in news:
             done.notes.append(f"{'/'.join(key)}: was changed by hand since it was collected, and is left so")
+            number = min(entries[key]["attempt"], len(every)) if key in entries else len(every)
+            store.stamp(key, every[number - 1])
+            entries[key] = _entry(every[number - 1], number, rules, done, key in late)
             continue
         winner = _winner(every, store, have, rules, judge, environment)
         if by_hand:
@@ -468,6 +475,10 @@ def _lay_out(
         entries[key] = _entry(winner, every.index(winner) + 1, rules, done, key in late)
     store.save()  # with the scores of --best
     done.entries = [entry for key, entry in sorted(entries.items()) if key in groups]
+    for name, rule in rules.rules.items():  # a slip in a name would cost somebody points
+        absent = [student for student in rule.extensions if (student, name) not in entries]
+        if absent and any(key[1] == name for key in groups):
+            done.notes.append(f"{name}: nothing was handed in by {', '.join(sorted(absent))}, whose extension the due dates name")
     document = {"schema": SCHEMA, "entries": [entries[key] for key in sorted(entries)]}
     write_atomically(into / COLLECTED, attempts.dumps(document))
     store.tidy()
@@ -524,6 +535,7 @@ def grader(timeout: float) -> tuple[Judge, Callable[[], str]]:
 def table(entries: Collection[dict[str, Any]]) -> Table:
     """Whose file was recognised as what."""
     result = Table("Student", "Assignment", "From", "In the download", "Attempt", "Late")
+    result.columns[3].overflow = "fold"  # whole names, for finding them
     for entry in entries:
         attempt = str(entry["attempt"]) + (f", {entry['submitted_at'][:16].replace('T', ' ')}" if entry["submitted_at"] else "")
         cells = (entry["student"], entry["assignment"], entry["platform"], entry["download"], attempt, lateness(entry))

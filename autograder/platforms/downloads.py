@@ -292,6 +292,8 @@ def _blackboard(level: Level, reading: _Reading) -> Found:
     for (login, at), parts in units.items():
         files = tuple(Entry(match["rest"], entry.size, entry.open) for match, entry in parts if match["rest"])
         told = next((entry for match, entry in parts if not match["rest"]), None)
+        if told and not files:  # what was typed into Blackboard is all that there is
+            files = (Entry("submission.txt", told.size, told.open),)
         moment = datetime.strptime(at, "%Y-%m-%d-%H-%M-%S") if _is_date(at) else None
         aware = moment.replace(tzinfo=reading.zone) if moment and reading.zone else None
         shown = next((entry.path for match, entry in parts if match["rest"]), parts[0][1].path)

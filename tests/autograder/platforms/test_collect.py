@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import resource
 import struct
 import zipfile
 from types import SimpleNamespace
@@ -115,6 +116,18 @@ def test_a_zip_for_each_student_is_opened_and_a_zip_in_that_is_not(tmp_path, int
     assert len(done.problems) == 1 and "John Doe handed in no notebook (work.zip)" in done.problems[0]
 
 
+def test_more_zips_than_a_process_may_keep_open(tmp_path, into):
+    inner = zipped(tmp_path / "i.zip", {"ch44.ipynb": ONE}).read_bytes()
+    files = {f"S {number}_{number}_assignsubmission_file_/work.zip": inner for number in range(60)}
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/proc/self/fd")) + 20, hard))
+    try:
+        done = collect.collect([zipped(tmp_path / "a.zip", files)], into)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert len(papers(into)) == 60 and not done.problems
+
+
 GRADESCOPE = """\
 submission_111:
   :submitters:
@@ -160,17 +173,19 @@ def test_blackboard(tmp_path, into):
         f"{head}_jane_doe_attempt_2026-11-20-12-30-00.txt": b"Name: Jane Doe (jane_doe)\r\nAssignment: Chapter 44\r\n",
         f"{head}_jroe_attempt_2026-11-19-09-00-00_ch44.ipynb": TWO,
         f"{head}_jroe_attempt_2026-11-23-09-00-00_ch44 (2).ipynb": THREE,
+        f"{head}_poe_attempt_2026-11-20-09-00-00.txt": b"Name: Ann Poe (poe)\nSubmission Field:\nsee my mail\n",
     }
     (tmp_path / "due.yml").write_text(DUE)
     download = zipped(tmp_path / "a.zip", files)
     done = collect.collect([download], into, due=tmp_path / "due.yml")
-    assert papers(into) == {("jane_doe", "ch44"): ONE, ("jroe", "ch44"): THREE} and not done.problems
+    assert papers(into) == {("jane_doe", "ch44"): ONE, ("jroe", "ch44"): THREE, ("poe", "ch44"): None}
+    assert len(done.problems) == 1 and "poe handed in no notebook (submission.txt)" in done.problems[0]
     jane, roe = by_student(done)["jane_doe"], by_student(done)["jroe"]
     assert (jane["name"], jane["login"], jane["late_seconds"], jane["penalty"]) == ("Jane Doe", "jane_doe", 1800, 0.1)
     assert (roe["attempt"], roe["late_seconds"]) == (2, 0)  # the extension
     without = collect.collect([download], tmp_path / "other")
     assert by_student(without)["jroe"]["submitted_at"] is None and papers(tmp_path / "other") == papers(into)
-    assert not without.problems and "have no zone" in without.notes[0]
+    assert "have no zone" in without.notes[0]
 
 
 def test_github(tmp_path, into):
@@ -362,6 +377,17 @@ def test_what_was_changed_by_hand_stays_until_something_new_comes_and_is_kept_th
     assert {ONE, THREE} <= set(tree(into / ".attempts").values())
 
 
+def test_a_time_that_was_told_wrongly_can_be_told_again(tmp_path, into):
+    (tmp_path / "due.yml").write_text(DUE)
+    download = zipped(tmp_path / "a.zip", {"doe_1_5_ch44.ipynb": ONE})
+    for day, late in ((22, 172_800), (19, 0), (21, 86_400)):
+        (tmp_path / "names.csv").write_text(f"id,student,submitted_at\n1,jane,2026-11-{day} 12:00\n")
+        done = collect.collect([download], into, names=tmp_path / "names.csv", due=tmp_path / "due.yml")
+        assert done.entries[0]["late_seconds"] == late
+        assert (into / "jane" / "ch44" / "timestamp.txt").read_text() == f"2026-11-{day} 12:00:00.000000 UTC"
+    assert done.notes == ["ch44: nothing was handed in by jroe, whose extension the due dates name"]
+
+
 def test_folders_that_were_there_before_are_kept(tmp_path, into):
     folder(into, {"doejane/ch44/ch44.ipynb": THREE, "doejane/ch43/ch43.ipynb": TWO, "other/ch44/ch44.ipynb": TWO})
     collect.collect([zipped(tmp_path / "a.zip", CANVAS)], into)
@@ -507,6 +533,13 @@ def test_bombs_are_refused_before_and_while_they_unpack(tmp_path, into, monkeypa
     assert papers(into)[("a", "ch44")] == TWO and "larger than" in done.problems[0]
 
 
+def test_a_thousand_bad_names_are_a_few_lines(tmp_path, into):
+    files = {"good_1_5_ch44.ipynb": ONE} | {f"../evil{number}": b"" for number in range(1000)}
+    done = collect.collect([zipped(tmp_path / "a.zip", files)], into)
+    assert papers(into) == {("good", "ch44"): ONE} and len(done.problems) == archives.MAX_TOLD + 1
+    assert done.problems[-1] == "a.zip: 980 more of its files are refused"
+
+
 def test_a_size_that_lies_is_counted(tmp_path):
     entry = archives.Entry("x", 10, lambda: io.BytesIO(bytes(5000)))
     with pytest.raises(archives.Refused, match="larger"):
@@ -580,8 +613,9 @@ def test_the_command_prints_a_table_and_its_exit_status_tells_what_was_not_under
 def test_a_platform_can_be_named(tmp_path, into):
     download = folder(tmp_path / "a", {"x_1_5_ch44.ipynb": ONE})
     assert collect.collect([download], into, force="canvas").entries[0]["student"] == "x"
-    done = collect.collect([download], tmp_path / "other", force="moodle")
-    assert not done.entries and len(done.problems) == 2
+    with pytest.raises(collect.CollectError, match=r"nothing was collected: x_1_5_ch44\.ipynb: no platform"):
+        collect.collect([download], tmp_path / "other", force="moodle")
+    assert not (tmp_path / "other").exists()
 
 
 def test_damaged_records_are_named_with_a_cure(tmp_path, into):
