@@ -6,39 +6,22 @@ is never given back; whoever is left out is named with the reason. Files are wri
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from autograder.grading import sources
-from autograder.grading.verdicts import FINAL, Verdict, clean_text, plain_name, read_all
+from autograder.grading.verdicts import FINAL, Verdict, clean_text, read_all
+from autograder.reporting import collected
+from autograder.reporting.collected import Handed
 from autograder.reporting.gradebook import GradebookWriter, Mark
 from autograder.reporting.report import STATE_WORDS, points
-from autograder.reporting.tables import Person
-
-COLLECTED = ".collected.json"
-_TEXTS = ("student", "assignment", "platform", "download")
-_OPTIONAL_TEXTS = ("platform_id", "name", "login", "submitted_at")
+from autograder.reporting.tables import Person, person
 
 
 class GiveBackError(ValueError):
     """Nothing can be given back; the message says what to do."""
-
-
-@dataclass(frozen=True)
-class Handed:
-    """How a submission came in: what `course collect` wrote down about it."""
-
-    student: str
-    assignment: str
-    platform: str
-    download: str
-    platform_id: str | None = None
-    name: str | None = None
-    login: str | None = None
-    submitted_at: str | None = None
 
 
 @dataclass(frozen=True)
@@ -131,56 +114,12 @@ def graded_from(grades: Path, submitted: Path | None) -> list[Path]:
     return [submitted]
 
 
-def read_collected(folders: Iterable[Path]) -> dict[tuple[str, str], Handed]:
-    """(student, assignment) → how it came in, from each folder's `.collected.json`, where there is one; the last counts.
-
-    Raises: GiveBackError that names file, entry and cure.
-    """
-    handed: dict[tuple[str, str], Handed] = {}
-    for folder in folders:
-        handed |= _read_collected(folder / COLLECTED)
-    return handed
-
-
-def _read_collected(path: Path) -> dict[tuple[str, str], Handed]:
-    if not path.exists():
-        return {}
-    cure = "collect again (`course collect`), or delete the file to give back without it"
+def collected_in(folders: Iterable[Path]) -> dict[tuple[str, str], Handed]:
+    """As `collected.read`. Raises: GiveBackError for a damaged list."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
-    except (OSError, ValueError) as error:
-        raise GiveBackError(f"{path}: cannot be read ({error}): {cure}") from None
-    if not isinstance(content, dict) or content.get("schema") != 1 or not isinstance(content.get("entries"), list):
-        raise GiveBackError(f'{path}: expected "schema": 1 and a list of "entries": {cure}')
-    handed: dict[tuple[str, str], Handed] = {}
-    for number, entry in enumerate(content["entries"], 1):
-        try:
-            one = _handed(entry)
-        except (ValueError, TypeError, KeyError) as error:
-            raise GiveBackError(f"{path}: entry {number}: {error}: {cure}") from None
-        if (one.student, one.assignment) in handed:
-            raise GiveBackError(f"{path}: entry {number}: a second one of {one.student} {one.assignment}: {cure}")
-        handed[one.student, one.assignment] = one
-    return handed
-
-
-def _refuse(name: str) -> float:
-    raise ValueError(f"{name} is not JSON")
-
-
-def _handed(entry: Any) -> Handed:
-    if not isinstance(entry, dict):
-        raise ValueError("not an object")
-    for key in _TEXTS:
-        if not isinstance(entry.get(key), str):
-            raise ValueError(f"{key!r} must be text")
-    for key in _OPTIONAL_TEXTS:
-        if not isinstance(entry.get(key), str | None):
-            raise ValueError(f"{key!r} must be text or null")
-    plain_name(entry["student"])
-    plain_name(entry["assignment"])
-    fields: dict[str, Any] = {key: entry.get(key) for key in (*_TEXTS, *_OPTIONAL_TEXTS)}
-    return Handed(**fields)
+        return collected.read(folders)
+    except ValueError as error:
+        raise GiveBackError(str(error)) from None
 
 
 def load(grades: Path, submitted: Path | None, db_url: str | None = None, only: Sequence[str] = ()) -> tuple[list[Result], Given]:
@@ -188,7 +127,7 @@ def load(grades: Path, submitted: Path | None, db_url: str | None = None, only: 
 
     Raises: GiveBackError if nothing was graded there, or an assignment of `only` was not.
     """
-    handed = read_collected(graded_from(grades, submitted))
+    handed = collected_in(graded_from(grades, submitted))
     try:
         verdicts = read_all(grades / "verdicts")
     except ValueError as error:
@@ -243,16 +182,15 @@ def _result(verdict: Verdict, marks: list[Mark], row: Mapping[str, Any], handed:
         mark = scores.get(item.exercise if by_hand else f"test_{item.exercise}")
         score = (mark.score if mark else None) if by_hand else item.score if mark is None or mark.score is None else mark.score
         questions.append(Question(item.exercise, by_hand, score, item.max_score, item.state, item.misconceptions, item.message))
-    name = ", ".join(filter(None, (row["last_name"], row["first_name"])))
-    person = Person(name or verdict.student, verdict.student, row["lms_user_id"])
-    if handed:
-        digits = handed.platform_id if handed.platform == "canvas" and (handed.platform_id or "").isdecimal() else None
-        login = handed.login or ("" if digits else verdict.student)  # Canvas's downloads show a name there, and no login
-        person = Person(name or handed.name or verdict.student, login, row["lms_user_id"] or digits)
     given = [mark.score for mark in marks if mark.question]
     total = None if None in given or not given else sum(score for score in given if score is not None)
     return Result(
-        replace(verdict, manual_score=total), tuple(questions), tuple(marks), row["late_submission_penalty"], person, handed
+        replace(verdict, manual_score=total),
+        tuple(questions),
+        tuple(marks),
+        row["late_submission_penalty"],
+        person(row, handed),
+        handed,
     )
 
 

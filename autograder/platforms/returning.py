@@ -9,7 +9,7 @@ from pathlib import Path
 from autograder.grading import judge
 from autograder.grading.verdicts import write_atomically
 from autograder.platforms import classroom50, give_back_canvas, give_back_moodle, give_back_nbgrader, gradescope_archive
-from autograder.platforms.give_back import GiveBackError, Given, Result, graded_from, load, read_collected
+from autograder.platforms.give_back import GiveBackError, Given, Result, collected_in, graded_from, load
 from autograder.reporting.machines import gradescope_json
 
 WITH_WORKSHEET = ("canvas", "moodle")
@@ -75,7 +75,7 @@ def _gradescope(request: Request, into: Path) -> Given:
     unknown = sorted(set(request.only) - judge.assignments())
     if unknown:
         raise GiveBackError(f"no such assignment: {', '.join(unknown)}; there are {', '.join(sorted(judge.assignments()))}")
-    collected = read_collected(graded_from(request.grades, request.submitted))
+    collected = collected_in(graded_from(request.grades, request.submitted))
     ours = {
         key for key, one in collected.items() if one.platform == "gradescope" and (not request.only or key[1] in request.only)
     }

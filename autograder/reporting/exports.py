@@ -1,4 +1,5 @@
-"""What teachers, learning platforms and CI read: derived from `DIR/verdicts` and the gradebook, and from nothing else.
+"""What teachers, learning platforms and CI read: derived from `DIR/verdicts` and the gradebook alone, but for
+Canvas's IDs, which stand in the list that `course collect` wrote beside the submissions.
 
 Every run writes everything anew and replaces it atomically, rows sorted by student and assignment. Verdicts contain text that
 learners chose: each format escapes it in its own way, and no CSV cell can be a formula.
@@ -7,12 +8,14 @@ learners chose: each format escapes it in its own way, and no CSV cell can be a 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from autograder.grading import sources
 from autograder.grading.verdicts import FINAL, Verdict, read_all, write_atomically
-from autograder.reporting import tables
+from autograder.reporting import collected, tables
 from autograder.reporting.machines import gradescope_json, junit_xml, measured_times
 from autograder.reporting.people import same_files, summary_markdown, table
 from autograder.reporting.report import report_html
@@ -37,6 +40,9 @@ def write_all(directory: Path, gradebook: GradebookWriter, judged: Iterable[Verd
     directory = Path(directory)
     verdicts = with_times(read_all(directory / "verdicts"), judged, directory / "junit.xml")
     marks, rows = gradebook.marks(), gradebook.grades()
+    handed: dict[tuple[str, str], collected.Handed] = {}
+    with suppress(ValueError):  # a damaged list costs IDs and no grade; `course return` says what is wrong with it
+        handed = collected.read(sources.read(directory))
     grades = countable(rows, verdicts)
     write_atomically(directory / "grades.csv", grades_csv(grades))
     write_atomically(directory / "questions.csv", questions_csv(verdicts))
@@ -46,8 +52,8 @@ def write_all(directory: Path, gradebook: GradebookWriter, judged: Iterable[Verd
     }
     write_atomically(directory / "grades.xlsx", workbook(sheets))
     write_atomically(directory / "junit.xml", junit_xml(verdicts))
-    write_atomically(directory / "canvas.csv", canvas_csv(grades))
-    files = tables.canvas_files(grades)
+    write_atomically(directory / "canvas.csv", canvas_csv(grades, handed))
+    files = tables.canvas_files(grades, handed)
     for path in (directory / "canvas").glob("*.csv"):
         if f"canvas/{path.name}" not in files:  # nobody has points there any longer
             path.unlink()

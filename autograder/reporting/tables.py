@@ -10,9 +10,11 @@ import io
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 from autograder.grading.verdicts import FINAL, Verdict, clean_text
+from autograder.reporting.collected import Handed
 
 QUESTION_COLUMNS = ("student", "assignment", "exercise", "state", "score", "max_score", "misconceptions")
 BY_HAND = " by hand"  # ends the name of the column that holds an assignment's open questions
@@ -80,15 +82,15 @@ _NUMBER = re.compile(r"-?[0-9.,]+%?\Z")
 Column = tuple[float, dict[str, float]]  # points possible, and student → points
 
 
-def canvas_csv(grades: Sequence[Mapping[str, Any]]) -> str:
+def canvas_csv(grades: Sequence[Mapping[str, Any]], handed: Mapping[tuple[str, str], Handed] = MappingProxyType({})) -> str:
     """Canvas's gradebook import: for each assignment the automatic points, and those by hand in a column of their own.
 
     A blank cell would clear the grade that Canvas has. So this is the largest part of the class's table that has no blanks: as many
     of the columns that most students have, and the students who have all of these. `canvas_files` has everything, column by column.
-    Canvas finds a student by ID (nbgrader's `lms_user_id`, if the gradebook has it) or by login (the submission's folder).
+    Canvas finds a student by ID (nbgrader's `lms_user_id`, or from Canvas's download) or by login (the submission's folder).
     """
     columns = canvas_columns(grades)
-    return canvas_table({name: columns[name] for name in without_blanks(columns)}, who(grades))
+    return canvas_table({name: columns[name] for name in without_blanks(columns)}, who(grades, handed))
 
 
 def without_blanks(columns: Mapping[str, Column]) -> list[str]:
@@ -102,9 +104,11 @@ def without_blanks(columns: Mapping[str, Column]) -> list[str]:
     return sorted(chosen)
 
 
-def canvas_files(grades: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+def canvas_files(
+    grades: Sequence[Mapping[str, Any]], handed: Mapping[tuple[str, str], Handed] = MappingProxyType({})
+) -> dict[str, str]:
     """One file for each column of Canvas, with the students who have points there: `canvas/ch44.csv`, `canvas/ch44 by hand.csv`."""
-    people = who(grades)
+    people = who(grades, handed)
     return {f"canvas/{name}.csv": canvas_table({name: column}, people) for name, column in canvas_columns(grades).items()}
 
 
@@ -131,13 +135,27 @@ class Person:
     identity: str | None = None  # Canvas's own number
 
 
-def who(grades: Iterable[Mapping[str, Any]]) -> dict[str, Person]:
-    """Student → name, last one first, login (the submission's folder), and Canvas's ID, as far as the gradebook knows them."""
-    people = {}
-    for row in grades:
-        student, name = row["student_id"], ", ".join(filter(None, (row["last_name"], row["first_name"])))
-        people[student] = Person(name or student, student, row["lms_user_id"])
-    return people
+def person(row: Mapping[str, Any], handed: Handed | None = None) -> Person:
+    """Name, last one first, login and Canvas's ID of a row of the gradebook.
+
+    What the gradebook does not know may be known from the download. A login is the submission's folder, but not where that came from
+    Canvas: its downloads show a number, which is the ID, and a name, which may be somebody else's login.
+    """
+    student, name = row["student_id"], ", ".join(filter(None, (row["last_name"], row["first_name"])))
+    shown, login, identity = "", None, None
+    if handed:
+        shown, login = handed.name or "", handed.login
+        if handed.platform == "canvas" and (handed.platform_id or "").isdecimal():
+            identity, login = handed.platform_id, login or ""
+    return Person(name or shown or student, student if login is None else login, row["lms_user_id"] or identity)
+
+
+def who(
+    grades: Iterable[Mapping[str, Any]], handed: Mapping[tuple[str, str], Handed] = MappingProxyType({})
+) -> dict[str, Person]:
+    """Student → how Canvas may know them."""
+    from_canvas = {student: one for (student, _), one in handed.items() if one.platform == "canvas"}
+    return {row["student_id"]: person(row, from_canvas.get(row["student_id"])) for row in grades}
 
 
 def canvas_table(columns: Mapping[str, Column], people: Mapping[str, Person]) -> str:
@@ -145,9 +163,9 @@ def canvas_table(columns: Mapping[str, Column], people: Mapping[str, Person]) ->
     students = sorted(set.intersection(*(set(column[1]) for column in columns.values()))) if columns else []
     lines: list[list[Any]] = [["    Points Possible", "", "", "", "", *(points for points, _ in columns.values())]]
     for student in students:
-        person = people[student]
+        known = people[student]
         scores = [column[1][student] for column in columns.values()]
-        lines.append([person.name, person.identity, "", _canvas_login(person), "", *scores])
+        lines.append([known.name, known.identity, "", _canvas_login(known), "", *scores])
     return csv_text((*_CANVAS_HEADER, *columns), lines)
 
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from autograder.grading import verdicts
+from autograder.grading import sources, verdicts
 from autograder.grading.verdicts import Verdict, clean_text
 from autograder.reporting import exports, tables
 from autograder.reporting.gradebook import GradebookWriter
@@ -198,6 +198,23 @@ def test_canvas_finds_odd_logins_and_no_cell_is_a_formula(writer):
         if row[1] == "4711"
         for column in range(6)
     ] == ["=cmd", "4711", "", "", "", "5.0"]
+
+
+def test_ids_of_canvas_come_from_its_download(writer, tmp_path):
+    writer.record(judged("doejane"))
+    writer.record(judged("bob"))
+    entry = {"student": "doejane", "assignment": "ch44", "platform": "canvas", "download": "doejane_101_7_ch44.ipynb"}
+    entry |= {"platform_id": "101", "name": "doejane"}
+    for folder, entries in (("old", [entry | {"platform_id": "1"}]), ("new", [entry])):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / ".collected.json").write_text(json.dumps({"schema": 1, "entries": entries}))
+        sources.remember(tmp_path, tmp_path / folder)
+    for path in ("canvas.csv", "canvas/ch44.csv"):
+        exports.write_all(tmp_path, writer)
+        assert [row[1:4:2] for row in table_of((tmp_path / path).read_text())[2:]] == [["", "bob"], ["101", ""]]
+    (tmp_path / "new" / ".collected.json").write_text("{")
+    exports.write_all(tmp_path, writer)
+    assert [row[3] for row in table_of((tmp_path / "canvas.csv").read_text())[2:]] == ["bob", "doejane"]
 
 
 @given(st.text(st.characters(exclude_categories=())))
