@@ -19,7 +19,7 @@ from nbformat import NotebookNode
 
 from autograder.authoring import assemble, chapter
 from autograder.grading import deadlines, intake, judge, sandbox, sources, verdicts
-from autograder.grading.deadlines import Deadlines, HandedIn
+from autograder.grading.deadlines import UNKNOWN, Deadlines, HandedIn, Rule
 from autograder.grading.verdicts import Verdict
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ def _write_all(
     results = []
     with gradebook.GradebookWriter(db_url or f"sqlite:///{(out / 'gradebook.db').resolve()}") as book:
         for name in {assignment for _, assignment, _ in tasks} & releases.keys():
-            _register(book, name, releases[name], rules)
+            _register(book, name, releases[name], rules.rules.get(name))
         for verdict, notebook in judged:
             handed_in, verdict = _handed_in(verdict, folders, rules)
             results.append(_write(verdict, notebook, out, book, releases, handed_in))
@@ -168,15 +168,14 @@ def _handed_in(verdict: Verdict, folders: dict[tuple[str, str], Path], rules: De
     """When a submission came in; where nobody can tell, the verdict gets a flag."""
     folder = folders.get((verdict.student, verdict.assignment))
     if folder is None:
-        return HandedIn(), verdict
+        return UNKNOWN, verdict
     try:
         return deadlines.handed_in(folder, verdict.student, verdict.assignment, rules), verdict
     except ValueError as error:
-        return HandedIn(), replace(verdict, flags=(f"no_time: {error}", *verdict.flags))
+        return UNKNOWN, replace(verdict, flags=(f"no_time: {error}", *verdict.flags))
 
 
-def _register(book: GradebookWriter, assignment: str, released: NotebookNode, rules: Deadlines) -> None:
-    rule = rules.rules.get(assignment)
+def _register(book: GradebookWriter, assignment: str, released: NotebookNode, rule: Rule | None = None) -> None:
     try:
         book.register(assignment, released, rule.due if rule else None)
     except ValueError as error:  # a cell that was withdrawn holds a score given by hand
@@ -223,7 +222,7 @@ def _write(
     out: Path,
     book: GradebookWriter,
     releases: dict[str, NotebookNode],
-    handed_in: HandedIn,
+    handed_in: HandedIn = UNKNOWN,
 ) -> Verdict:
     """Gradebook first, then the notebook that formgrader shows, then the verdict, which says that the rest is done."""
     from autograder.reporting import gradebook

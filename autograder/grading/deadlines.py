@@ -275,6 +275,9 @@ class HandedIn:
     share: float = 0.0
 
 
+UNKNOWN = HandedIn()
+
+
 def handed_in(folder: Path, student: str, assignment: str, deadlines: Deadlines) -> HandedIn:
     """Of one submission, by the `timestamp.txt` in its folder. Raises: ValueError if there is one that says no time."""
     rule = deadlines.rules.get(assignment)

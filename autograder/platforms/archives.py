@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
+from autograder.grading import intake
 from autograder.grading.verdicts import clean_text
 
 MAX_FILE = 256 << 20  # bytes of one file
@@ -216,8 +217,8 @@ def _safe_path(name: str) -> str | None:
     parts = [part for part in name.split("/") if part not in ("", ".")]
     if name.startswith("/") or ".." in parts or (parts and len(parts[0]) == 2 and parts[0][1] == ":"):
         raise Refused("would be written outside its folder")
-    if len(parts) > MAX_DEPTH:
-        raise Refused(f"lies more than {MAX_DEPTH} folders deep")
+    if len(parts) > MAX_DEPTH or len(name.encode(errors="replace")) > intake.MAX_PATH:
+        raise Refused(f"lies more than {MAX_DEPTH} folders deep, or has a name of more than {intake.MAX_PATH} bytes")
     if REPOSITORY in parts:
         return "/".join([*parts[: parts.index(REPOSITORY) + 1], "HEAD"])
     if not parts or any(_is_junk(part) for part in parts):

@@ -6,6 +6,7 @@ folder that the grader can judge. `.attempts/index.json` knows them all, by the 
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -220,8 +221,8 @@ def _copy(files: dict[str, Entry], folder: Path) -> list[str]:
     problems, total = [], 0
     for relative, entry in files.items():
         target = folder / relative
-        target.parent.mkdir(parents=True, exist_ok=True)
         try:
+            target.parent.mkdir(parents=True, exist_ok=True)
             with open(target, "xb") as stream:
                 for piece in archives.chunks(entry):
                     total += len(piece)
@@ -231,8 +232,10 @@ def _copy(files: dict[str, Entry], folder: Path) -> list[str]:
         except Refused as reason:
             target.unlink(missing_ok=True)
             problems.append(f"{relative}: {reason}")
-        except FileExistsError:
-            problems.append(f"{relative}: stands in the way of another file")
+        except OSError as error:
+            if error.errno not in (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.EINVAL, errno.EILSEQ):
+                raise
+            problems.append(f"{relative[:200]}: can't be laid out ({error.strerror})")
     return problems
 
 

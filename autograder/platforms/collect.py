@@ -36,6 +36,7 @@ from autograder.platforms.downloads import Handed
 
 COLLECTED = ".collected.json"
 SCHEMA = 1
+PEOPLES_IDS = ("canvas", "moodle")  # where an id is a person's, and names are what people are called
 NOTEBOOK = re.compile(r"\.ipynb(?:\.json|\.txt)?$", re.I)
 COPIED = re.compile(r"^copy of | ?\(\d+\)$|-\d+$|-copy\d*$|_\d+$", re.I)  # what systems add to a name that is taken
 ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar", ".xz", ".bz2")
@@ -192,7 +193,7 @@ class _Sorting:
         opened = [(one, self._opened(one)) for one in handed]
         papers, without = [], []
         for one, files in opened:
-            student = labels[self._person(one)]
+            student = labels[one.person]
             if one.unknown:
                 self.done.problems.append(f"{one.download}: {one.unknown}")
             found = self._of_one(one, student, files)
@@ -217,17 +218,12 @@ class _Sorting:
             )
         return papers
 
-    @staticmethod
-    def _person(one: Handed) -> tuple[str | None, ...]:
-        return one.platform, one.platform_id or one.student, one.login, one.name
-
-    def _labels(self, handed: Sequence[Handed]) -> dict[tuple[str | None, ...], str]:
+    def _labels(self, handed: Sequence[Handed]) -> dict[str, str]:
         """Each person's folder: what --names says; else what the platform shows, with the id where two are called the same."""
-        labels: dict[tuple[str | None, ...], str] = {}
-        owners = {student: (platform, number) for student, (platform, number) in self.before.items() if number}
+        labels: dict[str, str] = {}
+        owners = {student: (platform, number) for student, (platform, number) in self.before.items() if platform in PEOPLES_IDS}
         for one in handed:
-            person = self._person(one)
-            if person in labels:
+            if one.person in labels:
                 continue
             mapped = (
                 self.people.student(id=one.platform_id, login=one.login, email=one.email, name=one.name) if self.people else None
@@ -236,10 +232,11 @@ class _Sorting:
             if one.unknown:
                 shown = one.download.rpartition("/")[2]
             default = roster.label(shown)
-            owner = owners.setdefault(default, (one.platform, one.platform_id)) if not mapped and one.platform_id else None
-            if owner and owner[0] == one.platform and owner[1] != one.platform_id:
-                default = roster.label(f"{shown}-{one.platform_id}")
-            labels[person] = mapped or default
+            if one.platform_id and one.platform in PEOPLES_IDS and not mapped:
+                platform, number = owners.setdefault(default, (one.platform, one.platform_id))
+                if platform == one.platform and number != one.platform_id:
+                    default = roster.label(f"{shown}-{one.platform_id}")
+            labels[one.person] = mapped or default
             if self.people and not mapped and not one.unknown:
                 told = ", ".join(filter(None, (one.platform_id, one.login, one.email, one.name)))
                 self.done.problems.append(f"{one.download}: --names does not have {told}; collected as {default}")

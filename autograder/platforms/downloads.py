@@ -36,6 +36,8 @@ BLACKBOARD = re.compile(
 )
 GRADESCOPE = re.compile(r"submission_(\d+)")
 METADATA = "submission_metadata.yml"
+WANTED = (":submitters", ":created_at", ":name", ":sid", ":email")  # of its keys
+MAX_NESTING = 50
 EXCHANGE = re.compile(r"(?P<student>[^+]+)\+(?P<assignment>[^+]+)\+(?P<at>[^+]+(?:\+\d{4})?)(?:\+.*)?")
 
 
@@ -58,6 +60,13 @@ class Handed:
     late: bool = False
     unknown: str = ""  # why nobody can say whose it is
     trusts_timestamp: bool = False  # the platform's own timestamp.txt lies among the files
+
+    @property
+    def person(self) -> str:
+        """What tells people apart on this platform. Gradescope's ids are those of submissions, and everybody may have several."""
+        known = (self.student, self.email, self.login, self.name) if self.platform == "gradescope" else ()
+        told = next(filter(None, (*known, self.platform_id, self.login, self.student, self.name)), self.download)
+        return f"{self.platform} {told}"
 
 
 @dataclass
@@ -244,13 +253,43 @@ def _gradescope(level: Level, reading: _Reading) -> Found:
 def _metadata(entry: Entry, found: Found) -> dict[str, Any]:
     """The export's list of who is who; everything in it stays text."""
     try:
-        document = yaml.load(
-            archives.read(entry, MAX_METADATA).decode(errors="replace"), Loader=getattr(yaml, "CBaseLoader", yaml.BaseLoader)
-        )
-    except (Refused, yaml.YAMLError, RecursionError, ValueError) as error:
+        text = archives.read(entry, MAX_METADATA).decode(errors="replace")
+        return _mapping(_plain(yaml.parse(text, Loader=getattr(yaml, "CBaseLoader", yaml.BaseLoader))))
+    except (Refused, yaml.YAMLError, ValueError) as error:
         found.problems.append(f"{METADATA}: {str(error).splitlines()[0]}")
         return {}
-    return _mapping(document)
+
+
+def _plain(events: Iterable[yaml.Event]) -> Any:
+    """The document in a stream of YAML's events, without what this module has no use for (the results of tests, which may be long).
+
+    A stack of our own: YAML's own constructors recurse, in C, and a deep enough document ends the process.
+    """
+    stack: list[list[Any]] = [[]]  # of each open collection what it holds; a mapping's keys and values take turns
+    anchors: dict[str, Any] = {}
+    for event in events:
+        if isinstance(event, yaml.CollectionStartEvent):
+            stack.append([event])
+            if len(stack) > MAX_NESTING:
+                raise ValueError("is nested too deeply")
+            continue
+        if isinstance(event, yaml.CollectionEndEvent):
+            start, *inside = stack.pop()
+            value: Any = inside
+            if isinstance(start, yaml.MappingStartEvent):
+                pairs = zip(inside[::2], inside[1::2], strict=False)
+                value = {key: one for key, one in pairs if isinstance(key, str) and (not key.startswith(":") or key in WANTED)}
+            anchor = start.anchor
+        elif isinstance(event, yaml.ScalarEvent):
+            value, anchor = event.value, event.anchor
+        elif isinstance(event, yaml.AliasEvent):
+            value, anchor = anchors.get(event.anchor), None
+        else:
+            continue
+        if anchor:
+            anchors[anchor] = value
+        stack[-1].append(value)
+    return stack[0][0] if stack[0] else None
 
 
 def _mapping(value: Any) -> dict[str, Any]:
@@ -384,18 +423,23 @@ def _nbgrader(level: Level, reading: _Reading) -> Found:
             found.problems.append(f"{name}: is a bundle as it was released, nobody's submission")
         elif match := EXCHANGE.fullmatch(name):
             files = tuple(entry.under(f"{name}/") for entry in inside)
-            found.handed.append(_of_nbgrader(files, name, match["student"], match["assignment"], match["at"]))
+            found.handed.append(_of_nbgrader(files, name, match["student"], _known(match["assignment"], reading), match["at"]))
         else:
             for assignment, files_of in _level(entry.under(f"{name}/") for entry in inside).items():
                 if _is_file(assignment, files_of):
                     found.problems.append(f"{name}/{assignment}: lies in the student's folder, in no assignment's")
                     continue
                 files = tuple(entry.under(f"{assignment}/") for entry in files_of)
-                found.handed.append(_of_nbgrader(files, f"{name}/{assignment}", name, assignment.strip().lower(), ""))
+                found.handed.append(_of_nbgrader(files, f"{name}/{assignment}", name, _known(assignment, reading), ""))
     return found
 
 
-def _of_nbgrader(files: tuple[Entry, ...], download: str, student: str, assignment: str, at: str) -> Handed:
+def _known(name: str, reading: _Reading) -> str | None:
+    name = name.strip().lower()
+    return name if name in reading.known else None
+
+
+def _of_nbgrader(files: tuple[Entry, ...], download: str, student: str, assignment: str | None, at: str) -> Handed:
     told = next((entry for entry in files if entry.path == deadlines.TIMESTAMP), None)
     moment = _time(at)
     if told:

@@ -42,7 +42,7 @@ from nbgrader.dbutil import ALEMBIC_DIR
 from sqlalchemy import URL, and_, create_engine, delete, event, func, inspect, make_url, select, text, true
 from sqlalchemy.orm import Session, aliased
 
-from autograder.grading.deadlines import HandedIn
+from autograder.grading.deadlines import UNKNOWN, HandedIn
 from autograder.grading.verdicts import Item, Verdict, plain_name, write_atomically
 from autograder.reporting import passive
 
@@ -217,7 +217,7 @@ class GradebookWriter:
         verdict: Verdict,
         submitted: NotebookNode | None = None,
         previous: NotebookNode | None = None,
-        handed_in: HandedIn = HandedIn(),  # noqa: B008
+        handed_in: HandedIn = UNKNOWN,
     ) -> bool:
         """Write the automatic scores of a verdict, in one transaction. Returns whether the verdict is one that may be written.
 

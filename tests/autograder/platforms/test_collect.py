@@ -163,6 +163,10 @@ def test_gradescope(tmp_path, into):
     assert entries["3012"]["late_seconds"] == 0 and entries["3012"]["submitted_at"] == "2026-11-20T11:59:00.123456+00:00"
     assert (entries["li"]["late_seconds"], entries["li"]["penalty"]) == (24 * 3600 + 1800, 0.2)
     assert (into / "li" / "ch44" / "timestamp.txt").read_text() == "2026-11-21 12:30:00.000000 UTC"
+    later = GRADESCOPE.replace("submission_111", "submission_200").replace("2026-11-20 11:59", "2026-11-20 13:00")
+    files = {"submission_200/ch44.ipynb": TWO, "submission_113/ch44.ipynb": THREE, "submission_metadata.yml": later.encode()}
+    done = collect.collect([zipped(tmp_path / "later.zip", files)], into)
+    assert papers(into)["3012", "ch44"] == TWO and by_student(done)["3012"]["platform_id"] == "200"
     assert (into / ".due.yml").read_text() == DUE
 
 
@@ -579,6 +583,47 @@ def test_students_names_from_a_platform_cannot_leave_the_folder(tmp_path, into):
     students = [student for student, _ in papers(into)]
     assert len(students) == 3 and all("/" not in student and not student.startswith(".") for student in students)
     assert {path.name for path in tmp_path.iterdir()} == {"a.zip", "submitted"}
+
+
+def test_assignments_are_those_of_the_course_and_no_paths(tmp_path, into):
+    files = {
+        "jane+..+2026-11-20 10:00:00 UTC/x.ipynb": ONE,
+        "john+ps1+2026-11-20 10:00:00 UTC/ps1.ipynb": TWO,
+        "li+CH44+2026-11-20 10:00:00 UTC/CH44.ipynb": THREE,
+    }
+    done = collect.collect([zipped(tmp_path / "a.zip", files)], into)
+    assert papers(into) == {("li", "ch44"): THREE, ("jane", "ch44"): None, ("john", "ch44"): None} and len(done.problems) == 2
+    assert {path.name for path in tmp_path.iterdir()} == {"a.zip", "submitted"}
+
+
+def test_files_in_each_others_way_cost_nobody_else_anything(tmp_path, into):
+    work = {"ch44.ipynb": ONE, "a": b"file", "a/b": b"in a folder of its name", "x" * 120 + "/" + "y" * 120: b"long"}
+    files = {
+        "Jane_1_assignsubmission_file_/w.zip": zipped(tmp_path / "w", work).read_bytes(),
+        "John_2_assignsubmission_file_/ch44.ipynb": TWO,
+    }
+    done = collect.collect([zipped(tmp_path / "a.zip", files)], into)
+    assert papers(into) == {("Jane", "ch44"): ONE, ("John", "ch44"): TWO}
+    assert len(done.problems) == 1 and "a/b: can't be laid out" in done.problems[0]
+
+
+def test_a_list_of_who_is_who_that_is_nested_a_million_deep(tmp_path, into):
+    files = {"submission_1/ch44.ipynb": ONE, "submission_metadata.yml": b"submission_1: " + b"[" * 1_000_000}
+    done = collect.collect([zipped(tmp_path / "a.zip", files)], into)
+    assert papers(into) == {("submission_1", "ch44"): ONE} and done.problems[0].endswith("is nested too deeply")
+    files["submission_metadata.yml"] = (
+        b"submission_1:\n  :submitters:\n  - &1\n    :name: Jane\n  :results: {':name': [{}]}\nsubmission_2:\n  :submitters: [*1]\n"
+    )
+    done = collect.collect([zipped(tmp_path / "b.zip", files | {"submission_2/ch44.ipynb": TWO})], tmp_path / "other")
+    assert not done.problems and papers(tmp_path / "other") == {("Jane", "ch44"): TWO} and done.entries[0]["attempt"] == 2
+
+
+@pytest.mark.parametrize(
+    "name", ["CH44.ipynb", "ch44 (1).ipynb", "Copy of ch44.ipynb", "ch44.ipynb.json", "ch44.ipynb.txt", "CH44.IPYNB"]
+)
+def test_what_systems_make_of_a_name(tmp_path, into, name):
+    assert not collect.collect([zipped(tmp_path / "a.zip", {f"doe_1_5_{name}": ONE})], into).problems
+    assert papers(into) == {("doe", "ch44"): ONE} and list(tree(into / "doe")) == ["ch44/ch44.ipynb"]
 
 
 def test_a_folder_of_submitted_that_is_a_link_is_not_written_through(tmp_path, into):
