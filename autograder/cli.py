@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from enum import StrEnum
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, cast
@@ -264,6 +265,64 @@ def grade(
     low = [v for v in results if fail_under and (v.score < fail_under * v.max_score or not v.max_score)]
     if low:
         _stop(f"{len(low)} of {len(results)} submissions score under {fail_under:.0%}", LOW_SCORES)
+
+
+class Platform(StrEnum):
+    """Where `course return` gives back to."""
+
+    canvas = "canvas"
+    moodle = "moodle"
+    gradescope = "gradescope"
+    classroom50 = "classroom50"
+    nbgrader = "nbgrader"
+
+
+@app.command("return")
+def give_back(
+    to: Annotated[Platform, typer.Option(help="The learning platform.")] = Platform.canvas,
+    out: Annotated[Path, typer.Option(help="The folder that `course grade` wrote.")] = Path("grades"),
+    submitted: Annotated[
+        Path | None,
+        typer.Option(help="The folder that was graded, where `course collect` says who is who; by default what OUT was made of."),
+    ] = None,
+    worksheet: Annotated[
+        Path | None, typer.Option(help="Moodle's grading worksheet, or the gradebook as Canvas exports it: is filled in.")
+    ] = None,
+    into: Annotated[
+        Path | None, typer.Option(help="Where the files go: OUT/return; for nbgrader OUT, its course folder.")
+    ] = None,
+    only: Annotated[list[str] | None, typer.Option(help="Of this assignment only, as in --only ch44; may be repeated.")] = None,
+    automatic: Annotated[
+        bool, typer.Option("--automatic", help="Moodle: automatic points alone, without those by hand.")
+    ] = False,
+    db_url: Annotated[str | None, typer.Option(help="nbgrader's gradebook; sqlite:///OUT/gradebook.db by default.")] = None,
+    trust_submissions: Annotated[
+        bool,
+        typer.Option("--trust-submissions", help="Gradescope: an archive that grades WITHOUT a sandbox. For your own code only."),
+    ] = False,
+) -> None:
+    """Write what a learning platform takes: grades and feedback. Exit status: 0 all, 2 bad input, 3 cannot be written, 4 some left out."""
+    from sqlalchemy.exc import SQLAlchemyError
+
+    from autograder.platforms import give_back, returning
+
+    request = returning.Request(out, submitted, into, worksheet, tuple(only or ()), db_url, automatic, trust_submissions)
+    try:
+        given = returning.give_back(to.value, request)
+    except (give_back.GiveBackError, FileNotFoundError) as error:
+        _stop(error)
+    except (OSError, SQLAlchemyError) as error:
+        _stop(f"the files cannot be written: {error}. What is written is whole; mend this and return again.", BROKEN)
+    for path in given.files[:50]:
+        print(path)
+    if len(given.files) > 50:
+        print(f"… and {len(given.files) - 50} more files")
+    for note in given.notes:
+        print(note)
+    for line in given.left_out:
+        err.print(f"left out: {line}", markup=False)
+    if given.left_out:
+        _stop(f"{len(given.left_out)} left out; everything else is written", LEFT_OVER)
 
 
 @app.command()

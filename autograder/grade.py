@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from nbformat import NotebookNode
 
 from autograder.authoring import assemble, chapter
-from autograder.grading import deadlines, intake, judge, sandbox, verdicts
+from autograder.grading import deadlines, intake, judge, sandbox, sources, verdicts
 from autograder.grading.deadlines import UNKNOWN, Deadlines, HandedIn, Rule
 from autograder.grading.verdicts import Verdict
 
@@ -72,6 +72,7 @@ def grade(
     out.mkdir(parents=True, exist_ok=True)
     judging = _on_dask(tasks, scheduler, timeout) if scheduler else _here(tasks, jobs, timeout, trusted)
     with _one_run_at_a_time(out), judging as judged:
+        sources.remember(out, submitted)
         return _write_all(tasks, judged, out, db_url, progress, rules)
 
 
@@ -110,7 +111,7 @@ def _write_all(
             results.append(_write(verdict, notebook, out, book, releases, handed_in))
             progress(len(results), len(tasks), f"{verdict.student}/{verdict.assignment}")
         try:
-            exports.write_all(out, book)
+            exports.write_all(out, book, results)
         except ValueError as error:  # a verdict file that somebody has damaged
             raise GradingError(str(error)) from None
     return sorted(results, key=lambda verdict: (verdict.student, verdict.assignment))

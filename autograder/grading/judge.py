@@ -125,6 +125,7 @@ def judge(submission: intake.Submission, release: Released, timeout: float = 60.
     """
     start = time.monotonic()
     flags = list(submission.flags)
+    timings: dict[str, float] = {}
     if submission.notebook is None:
         findings = [
             Finding(exercise.name, "error", 0.0, exercise.points, message=submission.problem) for exercise in release.exercises
@@ -144,9 +145,12 @@ def judge(submission: intake.Submission, release: Released, timeout: float = 60.
         run = _Run(submission, release, timeout, trusted)
         found = run.findings()
         flags += run.flags
+        timings = run.timings
         for artefact in release.exercises:
             if isinstance(artefact, FrozenArtefact):
+                began = time.monotonic()
                 found[artefact.name], receipts = flights.judge(artefact, submission.folder, timeout)
+                timings[artefact.name] = round(time.monotonic() - began, 3)
                 flags = receipts + flags  # first, as the list of flags is cut at its end
         findings = [found[exercise.name] for exercise in release.exercises]
         uncompared = any(flag.startswith(NOT_COMPARED) for flag in run.flags)
@@ -165,6 +169,7 @@ def judge(submission: intake.Submission, release: Released, timeout: float = 60.
             flags=tuple(flags),
             seconds=round(time.monotonic() - start, 3),
             environment=release.environment,
+            timings=timings,
         )
     )
 
@@ -230,6 +235,7 @@ class _Run:
 
     def __init__(self, submission: intake.Submission, release: Released, timeout: float, trusted: bool) -> None:
         self.flags: list[str] = []
+        self.timings: dict[str, float] = {}  # exercise → seconds spent in asking for it
         self._submission, self._timeout, self._trusted = submission, timeout, trusted
         self._exercises = {one.name: one for one in release.exercises if isinstance(one, FrozenExercise)}
         self._cells = runnable(submission.notebook, release)
@@ -318,7 +324,7 @@ class _Run:
     def _ask_all(self, sandbox: Sandbox, attempt: Attempt) -> None:
         """Ask for the exercises of an attempt, until the sandbox is lost to one of them."""
         for later, name in zip(range(len(attempt.exercises) - 1, -1, -1), attempt.exercises, strict=True):
-            exercise, lost = self._exercises[name], True
+            exercise, lost, began = self._exercises[name], True, time.monotonic()
             try:
                 finding = self._ask(sandbox, exercise, share(self._left(), later + attempt.spares, self._timeout))
                 lost = False
@@ -331,6 +337,7 @@ class _Run:
                     return
                 finding = _failed(exercise, "error", f"The call ended the process: {error}.")
             self._found[name] = finding
+            self.timings[name] = round(self.timings.get(name, 0.0) + time.monotonic() - began, 3)
             if finding.state == "error" and not attempt.complete:
                 self._happened(tried=self._past.tried | {name})
             else:

@@ -12,12 +12,13 @@ import os
 import re
 import tempfile
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 SCHEMA = 1
 STATES = ("correct", "partial", "wrong", "not_implemented", "error", "timeout", "manual")
+FINAL = ("graded", "student_error")  # the statuses whose scores count
 STATUSES = ("graded", "student_error", "needs_review", "infra_error")
 MAX_BYTES = 1_000_000
 MAX_FLAGS = 50
@@ -103,6 +104,7 @@ class Verdict:
     seconds: float = 0.0
     environment: str = ""
     schema: int = SCHEMA
+    timings: Mapping[str, float] = field(default_factory=dict, compare=False)  # exercise → seconds; never written to the file
 
     @classmethod
     def of(cls, value: Verdict | Mapping[str, Any]) -> Verdict:
@@ -130,6 +132,7 @@ class Verdict:
             flags=tuple(flags),
             seconds=_points("seconds", raw.seconds),
             environment=clean_text(raw.environment, LABEL_BYTES),
+            timings={name: _points("timings", seconds) for name, seconds in raw.timings.items()},
         )
         _check_score(verdict.assignment, verdict.score, verdict.max_score)
         return verdict
@@ -142,7 +145,9 @@ class Verdict:
 
 def to_json(verdict: Verdict) -> str:
     """Strict JSON, the same text for the same verdict. Raises: ValueError past 1 MB."""
-    text = json.dumps(asdict(Verdict.of(verdict)), sort_keys=True, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    content = asdict(Verdict.of(verdict))
+    del content["timings"]
+    text = json.dumps(content, sort_keys=True, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     if len(text.encode()) >= MAX_BYTES:
         raise ValueError(f"verdict of {len(text)} characters: too many items")
     return text
@@ -155,7 +160,7 @@ def _refuse_constant(name: str) -> float:
 def from_json(text: str) -> Verdict:
     """The inverse of `to_json`. Raises: ValueError for anything but a valid verdict."""
     raw = json.loads(text, parse_constant=_refuse_constant)
-    keys = {field.name for field in fields(Verdict)}
+    keys = {one.name for one in fields(Verdict)} - {"timings"}
     if not isinstance(raw, dict) or not keys >= set(raw):
         raise ValueError(f"not a verdict: expected the keys {sorted(keys)}")
     try:
@@ -164,9 +169,9 @@ def from_json(text: str) -> Verdict:
         raise ValueError(f"not a verdict: {problem}") from None
 
 
-def write_atomically(path: Path, text: str) -> Path:
-    """Replace `path` by `text` (UTF-8) in one step, durably; folders are made, an unchanged file is left alone."""
-    data = text.encode()
+def write_atomically(path: Path, content: str | bytes) -> Path:
+    """Replace `path` by `content` (text as UTF-8) in one step, durably; folders are made, an unchanged file is left alone."""
+    data = content.encode() if isinstance(content, str) else content
     if path.is_file() and path.read_bytes() == data:
         return path
     path.parent.mkdir(parents=True, exist_ok=True)

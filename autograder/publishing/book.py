@@ -59,7 +59,7 @@ import jupyter_book.sphinx, myst_nb.sphinx_ext, sphinx_book_theme, sphinxcontrib
 from jupyter_book.cli.main import main
 main(json.loads(sys.stdin.read()))
 """
-HOW_TO = ("how-to/learners", "how-to/teachers", "how-to/contributors")
+HOW_TO = ("how-to/learners", "how-to/teachers", "how-to/platforms", "how-to/contributors")
 MATHJAX = ("tex-chtml-full.js", "output/chtml/fonts/**/*", "a11y/*", "sre/**/*")
 
 __all__ = ["BookError", "build", "executed_outputs"]

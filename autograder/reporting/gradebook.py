@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -134,6 +135,16 @@ def _given_by_hand(db: Session, cell: BaseCell) -> bool:
     return any(grade.manual_score is not None or grade.extra_credit is not None for grade in grades) or any(
         comment.manual_comment is not None for comment in comments
     )
+
+
+@dataclass(frozen=True)
+class Mark:
+    """What the gradebook holds for one cell of a submission: None as long as a question waits for points by hand."""
+
+    cell: str
+    question: bool
+    score: float | None
+    max_score: float
 
 
 class GradebookWriter:
@@ -284,7 +295,8 @@ class GradebookWriter:
         """The rows of nbgrader's CSV exporter, by student and assignment, with one query instead of one for each row.
 
         As there, a student of the gradebook who has not submitted an assignment has a row with score 0 and no timestamp.
-        Each row has `lms_user_id` and `submitted` (whether there is a submission) in addition.
+        Each row has in addition `lms_user_id`, `submitted` (whether there is a submission), and the score in its two parts:
+        `automatic` of `automatic_max`, and `by_hand` (None until no question waits) of `by_hand_max`, penalty not yet taken off.
         """
         mine = and_(SubmittedAssignment.assignment_id == Assignment.id, SubmittedAssignment.student_id == Student.id)
         query = (
@@ -299,11 +311,64 @@ class GradebookWriter:
         )  # fmt: skip
         with self._transaction() as db:
             found = db.execute(query).all()
+        marks = self.marks()
+        maxima = self._maxima()
         rows = []
         for *first, raw, penalty, maximum, lms_user_id, submission in found:
             row = dict(zip(GRADE_COLUMNS, (*first, raw, penalty, max(0.0, raw - penalty), maximum), strict=True))
-            rows.append(row | {"lms_user_id": lms_user_id, "submitted": submission is not None})
+            mine_all = marks.get((row["student_id"], row["assignment"]), ())
+            by_hand = [mark.score for mark in mine_all if mark.question]
+            given = [score for score in by_hand if score is not None]
+            rows.append(
+                row
+                | {"lms_user_id": lms_user_id, "submitted": submission is not None}
+                | maxima.get(row["assignment"], {"automatic_max": 0.0, "by_hand_max": 0.0})
+                | {"automatic": sum(mark.score or 0.0 for mark in mine_all if not mark.question)}
+                | {"by_hand": sum(given) if len(given) == len(by_hand) else None}
+            )
         return rows
+
+    def _maxima(self) -> dict[str, dict[str, float]]:
+        """Assignment → the points of its exercises and of its open questions."""
+        solution = aliased(SolutionCell, flat=True)
+        query = (
+            select(Assignment.name, GradeCell.max_score, solution.id)
+            .select_from(GradeCell).join(Notebook, Notebook.id == GradeCell.notebook_id).join(Assignment)
+            .outerjoin(solution, and_(solution.name == GradeCell.name, solution.notebook_id == GradeCell.notebook_id))
+        )  # fmt: skip
+        with self._transaction() as db:
+            found = db.execute(query).all()
+        maxima: dict[str, dict[str, float]] = {}
+        for assignment, points, question in found:
+            of = maxima.setdefault(assignment, {"automatic_max": 0.0, "by_hand_max": 0.0})
+            of["automatic_max" if question is None else "by_hand_max"] += points
+        return maxima
+
+    def marks(self) -> dict[tuple[str, str], list[Mark]]:
+        """(student, assignment) → its marks by cell, as a teacher left them: points by hand count before automatic ones.
+
+        A question that was left as released has 0 without a teacher, as in nbgrader."""
+        solution = aliased(SolutionCell, flat=True)
+        query = (
+            select(
+                SubmittedAssignment.student_id, Assignment.name, GradeCell.name, solution.id,
+                Grade.manual_score, Grade.auto_score, Grade.extra_credit, GradeCell.max_score,
+            )
+            .select_from(Grade).join(GradeCell, GradeCell.id == Grade.cell_id)
+            .join(SubmittedNotebook, SubmittedNotebook.id == Grade.notebook_id)
+            .join(SubmittedAssignment, SubmittedAssignment.id == SubmittedNotebook.assignment_id)
+            .join(Assignment, Assignment.id == SubmittedAssignment.assignment_id)
+            .outerjoin(solution, and_(solution.name == GradeCell.name, solution.notebook_id == GradeCell.notebook_id))
+            .order_by(SubmittedAssignment.student_id, Assignment.name, GradeCell.name)
+        )  # fmt: skip
+        with self._transaction() as db:
+            found = db.execute(query).all()
+        marks: dict[tuple[str, str], list[Mark]] = {}
+        for student, assignment, cell, question, by_hand, automatic, extra, points in found:
+            score = automatic if by_hand is None else by_hand
+            score = None if score is None else score + (extra or 0.0)
+            marks.setdefault((student, assignment), []).append(Mark(cell, question is not None, score, points))
+        return marks
 
 
 def _utc(moment: datetime | None) -> datetime | None:

@@ -7,11 +7,16 @@ from __future__ import annotations
 
 import base64
 import hashlib
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from jinja2 import Environment
 from markupsafe import Markup
 
-from autograder.grading.verdicts import Verdict
+from autograder.grading.verdicts import FINAL, Verdict
+
+if TYPE_CHECKING:
+    from autograder.reporting.gradebook import Mark
 
 STATE_WORDS = {
     "correct": "correct",
@@ -98,7 +103,7 @@ content="default-src 'none'; style-src 'sha256-{{ style_hash }}'; base-uri 'none
 <td class="state {{ item.state }}">
 {%- if item in explained %}<a href="#exercise-{{ loop.index }}">{{ words[item.state] }}</a>
 {%- else %}{{ words[item.state] }}{% endif %}</td>
-<td>{{ "–" if item.state == "manual" else item.score | points }} / {{ item.max_score | points }}</td></tr>
+<td>{{ "–" if scores[loop.index0] is none else scores[loop.index0] | points }} / {{ item.max_score | points }}</td></tr>
 {% endfor %}
 </tbody>
 </table>
@@ -126,9 +131,13 @@ _environment.filters["breakable"] = lambda name: Markup("_<wbr>").join(name.spli
 _template = _environment.from_string(_PAGE)
 
 
-def report_html(verdict: Verdict) -> str:
-    """A page for the learner: self-contained, without scripts, and forbidden by its own policy to load or run anything."""
+def report_html(verdict: Verdict, marks: Sequence[Mark] = ()) -> str:
+    """A page for the learner: self-contained, without scripts, and forbidden by its own policy to load or run anything.
+
+    `marks` are the gradebook's, where a teacher has given points for open questions."""
+    given = {mark.cell: mark.score for mark in marks if mark.question and verdict.status in FINAL}
     return _template.render(
+        scores=[given.get(item.exercise) if item.state == "manual" else item.score for item in verdict.items],
         verdict=verdict,
         words=STATE_WORDS,
         status_words=STATUS_WORDS[verdict.status],

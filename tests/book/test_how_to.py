@@ -146,6 +146,12 @@ def test_the_teachers_page(reader, html):  # the built book, since a first relea
     reader("teachers").run()
 
 
+def test_the_platforms_page(reader):
+    page = reader("platforms")
+    release.release(page.folder / "release", ["ch44"])
+    page.run()
+
+
 def test_the_contributors_page(reader):
     page = reader("contributors")
     for name in SOURCES:

@@ -2,6 +2,7 @@
 
 import json
 import signal
+from types import SimpleNamespace
 
 import nbformat
 import numpy as np
@@ -66,6 +67,21 @@ def test_a_cell_that_was_not_sent_is_not_blamed():
     attempt = run("def f(): ...", "g = 1")
     assert not attempt._load(Scripted(encode({"running": 2})), Attempt((0,), ("f",)))
     assert attempt._past == Past(lost=(0,))
+
+
+def test_each_exercise_is_timed(monkeypatch):
+    now = [100.0]
+
+    def asked(*_):
+        now[0] += 2.5
+        return judge._failed(EXERCISE, "wrong", "")
+
+    attempt = run("def f(): ...")
+    monkeypatch.setattr(judge, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(attempt, "_left", lambda: 1.0)
+    monkeypatch.setattr(attempt, "_ask", asked)
+    attempt._ask_all(Scripted(b""), Attempt((0,), ("f",)))
+    assert attempt.timings == {"f": 2.5}
 
 
 @pytest.mark.parametrize("sources", [(), ("def f(): ...",)], ids=["no cells", "all of them lost"])

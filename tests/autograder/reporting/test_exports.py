@@ -1,6 +1,7 @@
 import csv
 import io
 import json
+import zipfile
 from html.parser import HTMLParser
 from xml.etree import ElementTree
 
@@ -10,11 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from autograder.grading import verdicts
+from autograder.grading import sources, verdicts
 from autograder.grading.verdicts import Verdict, clean_text
-from autograder.reporting import exports
+from autograder.reporting import exports, tables
 from autograder.reporting.gradebook import GradebookWriter
-from autograder.reporting.report import report_html
+from autograder.reporting.report import STATE_WORDS, report_html
+from autograder.reporting.workbook import workbook
 
 ODD_STUDENTS = ("=1+1", "a,b", '"quoted"', "<b>&amp;", "[red]x", "s 001", "|", "ü")
 
@@ -93,27 +95,126 @@ def test_questions_csv_has_a_row_for_each_item():
 
 @given(st.text(st.characters(exclude_categories=())), st.sampled_from(("", "=", " +", "\n-", "@", "\t", "\r", "＝")))
 def test_no_csv_cell_is_a_formula(text, start):
-    cell, number, blank = next(csv.reader(io.StringIO(exports._csv((start + text, -1.5, None), []), newline="")))
+    cell, number, blank = next(csv.reader(io.StringIO(tables.csv_text((start + text, -1.5, None), []), newline="")))
     assert cell in (clean_text(start + text), "'" + clean_text(start + text))
     assert not cell.startswith(("\t", "\r")) and not cell.lstrip().startswith(tuple("=+-@＝＋－＠"))
     assert (number, blank) == ("-1.5", "")
 
 
-def test_canvas_has_points_possible_names_and_blanks(writer):
-    writer.register("ch45", release())
-    writer.record(judged("s001", {"compute_gae": 1.0}))
-    writer.record(judged("s002", assignment="ch45"))
+def table_of(text):
+    return list(csv.reader(io.StringIO(text)))
+
+
+def name_of(writer, student, **columns):
     with writer._transaction() as db:
         from nbgrader.api import Student
 
-        student = db.get(Student, "s001")
-        student.last_name, student.first_name, student.lms_user_id = "Noether", "Emmy", "4711"
-    assert list(csv.reader(io.StringIO(exports.canvas_csv(writer.grades())))) == [
-        ["Student", "ID", "SIS User ID", "SIS Login ID", "Section", "ch44", "ch45"],
-        ["    Points Possible", "", "", "", "", "7.0", "7.0"],
-        ["Noether, Emmy", "4711", "", "s001", "", "3.0", ""],
-        ["s002", "", "", "s002", "", "", "5.0"],
+        for column, value in columns.items():
+            setattr(db.get(Student, student), column, value)
+
+
+def by_hand(writer, student, points, cell="tradeoff", assignment="ch44"):
+    """A teacher's points in formgrader."""
+    from nbgrader.api import Gradebook
+
+    with Gradebook(str(writer._engine.url)) as book:
+        grade = book.find_grade(cell, assignment, assignment, student)
+        grade.manual_score, grade.needs_manual_grade = points, False
+        book.db.commit()
+
+
+def test_canvas_shows_automatic_points_and_those_by_hand_in_two_columns(writer):
+    writer.record(judged("s001", {"compute_gae": 1.0}), submission())
+    writer.record(judged("s002"), submission())
+    name_of(writer, "s001", last_name="Noether", first_name="Emmy", lms_user_id="4711")
+    waiting = [
+        ["Student", "ID", "SIS User ID", "SIS Login ID", "Section", "ch44"],
+        ["    Points Possible", "", "", "", "", "5.0"],
+        ["Noether, Emmy", "4711", "", "s001", "", "3.0"],
+        ["s002", "", "", "s002", "", "5.0"],
     ]
+    assert table_of(exports.canvas_csv(writer.grades())) == waiting
+    by_hand(writer, "s001", 1.5)
+    assert table_of(exports.canvas_csv(writer.grades())) == waiting
+    assert table_of(tables.canvas_files(writer.grades())["canvas/ch44 by hand.csv"])[2:] == [
+        ["Noether, Emmy", "4711", "", "s001", "", "1.5"]
+    ]
+    by_hand(writer, "s002", 2.0)
+    assert [row[5:] for row in table_of(exports.canvas_csv(writer.grades()))] == [
+        ["ch44", "ch44 by hand"],
+        ["5.0", "2.0"],
+        ["3.0", "1.5"],
+        ["5.0", "2.0"],
+    ]
+
+
+@pytest.mark.parametrize("automatic, given, penalty, expected", [(5, 2, 1, (4, 2)), (1, 2, 2.5, (0, 0.5)), (1, 2, 4, (0, 0))])
+def test_a_late_submission_loses_automatic_points_first(automatic, given, penalty, expected):
+    row = {
+        "student_id": "s", "assignment": "ch44", "submitted": True, "late_submission_penalty": penalty,
+        "automatic": automatic, "automatic_max": 5, "by_hand": given, "by_hand_max": 2,
+    }  # fmt: skip
+    columns = tables.canvas_columns([row])
+    assert (columns["ch44"][1]["s"], columns["ch44 by hand"][1]["s"]) == expected
+
+
+def test_an_import_into_canvas_clears_no_grade(writer, tmp_path):
+    writer.register("ch45", release())
+    for student in ("s001", "s002", "s003"):
+        writer.record(judged(student), submission())
+    writer.record(judged("s003", assignment="ch45"), submission())
+    writer.record(judged("s004", assignment="ch45"), submission())
+    exports.write_all(tmp_path, writer)
+    (tmp_path / "canvas" / "ch43.csv").write_text("of a chapter that is graded no longer")
+    exports.write_all(tmp_path, writer)
+    files = {path.name: table_of(path.read_text()) for path in [tmp_path / "canvas.csv", *(tmp_path / "canvas").iterdir()]}
+    assert all(row[5:] and all(row[5:]) for rows in files.values() for row in rows)
+    assert {name: [row[3] for row in rows[2:]] for name, rows in files.items()} == {
+        "canvas.csv": ["s001", "s002", "s003"],  # with ch45 only one student would be left
+        "ch44.csv": ["s001", "s002", "s003"],
+        "ch45.csv": ["s003", "s004"],
+    }
+
+
+def test_canvas_finds_odd_logins_and_no_cell_is_a_formula(writer):
+    odd = ("-dash", "+plus", "@handle", "a.b-c@uni.edu", "+4915112345", "=cmd", "-2+3", "=cmd|' -C calc'!A0", "1.234.567", "12,5")
+    for student in odd:
+        writer.record(judged(student))
+    rows = table_of(exports.canvas_csv(writer.grades()))[2:]
+    logins = [row[3] for row in rows]
+    assert {student for student in odd if student in logins} == {*odd} - {"=cmd", "-2+3", "=cmd|' -C calc'!A0"}
+    assert [s for s in odd if not tables.canvas_finds(tables.Person("", s))] == [
+        "=cmd",
+        "-2+3",
+        "=cmd|' -C calc'!A0",
+        "1.234.567",
+        "12,5",
+    ]
+    assert all(tables.canvas_finds(tables.Person("", student, "4711")) for student in odd)
+    name_of(writer, "=cmd", lms_user_id="4711")
+    assert [
+        row[0].removeprefix("'") if column == 0 else row[column]
+        for row in table_of(exports.canvas_csv(writer.grades()))
+        if row[1] == "4711"
+        for column in range(6)
+    ] == ["=cmd", "4711", "", "", "", "5.0"]
+
+
+def test_ids_of_canvas_come_from_its_download(writer, tmp_path):
+    writer.record(judged("doejane"))
+    writer.record(judged("bob"))
+    entry = {"student": "doejane", "assignment": "ch44", "platform": "canvas", "download": "doejane_101_7_ch44.ipynb"}
+    entry |= {"platform_id": "101", "name": "doejane"}
+    for folder, entries in (("old", [entry | {"platform_id": "1"}]), ("new", [entry])):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / ".collected.json").write_text(json.dumps({"schema": 1, "entries": entries}))
+        sources.remember(tmp_path, tmp_path / folder)
+    for path in ("canvas.csv", "canvas/ch44.csv"):
+        exports.write_all(tmp_path, writer)
+        assert [row[1:4:2] for row in table_of((tmp_path / path).read_text())[2:]] == [["", "bob"], ["101", ""]]
+    (tmp_path / "new" / ".collected.json").write_text("{")
+    exports.write_all(tmp_path, writer)
+    assert [row[3] for row in table_of((tmp_path / "canvas.csv").read_text())[2:]] == ["bob", "doejane"]
 
 
 @given(st.text(st.characters(exclude_categories=())))
@@ -147,6 +248,26 @@ def test_junit_counts_and_kinds():
     assert (second.get("tests"), second.get("errors"), second[0].get("name")) == ("8", "2", "submission")
 
 
+def test_junit_has_a_time_for_each_case_also_of_students_who_are_absent(writer, tmp_path):
+    result = Verdict.of(verdict(seconds=2.5, timings={"compute_gae": 1.25, "td_residuals": 0.5}))
+    writer.record(result)
+    verdicts.write(tmp_path / "verdicts", result)
+    times = {"compute_gae": "1.250", "td_residuals": "0.500", "tradeoff": "0.000"}
+    for judged_now in ([result], []):
+        exports.write_all(tmp_path, writer, judged_now)
+        (suite,) = ElementTree.parse(tmp_path / "junit.xml").getroot()
+        assert suite.get("time") == "2.500" and {case.get("name"): case.get("time") for case in suite} == times
+    verdicts.write(tmp_path / "verdicts", Verdict.of(verdict(seconds=3.0)))  # judged elsewhere: no time is invented for it
+    exports.write_all(tmp_path, writer)
+    (suite,) = ElementTree.parse(tmp_path / "junit.xml").getroot()
+    assert [case.get("time") for case in suite] == [None, None, "0.000"]
+
+
+def test_no_timing_is_in_a_verdict_file():
+    text = verdicts.to_json(Verdict.of(verdict(timings={"compute_gae": 1.25})))
+    assert "timings" not in json.loads(text) and verdicts.from_json(text).timings == {}
+
+
 def test_gradescope_results():
     result = json.loads(exports.gradescope_json(every_state()))
     assert result["score"] == 0.5
@@ -157,6 +278,51 @@ def test_gradescope_results():
     ]
     assert all(test["visibility"] == "visible" for test in result["tests"])
     assert "graded by hand" in result["output"]
+
+
+def test_gradescope_gets_points_given_by_hand(writer):
+    one = judged()
+    writer.record(one, submission())
+    marks = writer.marks()["s001", "ch44"]
+    assert "2 points, are graded by hand" in exports.gradescope_json(one, marks)
+    assert json.loads(exports.gradescope_json(one, marks))["score"] == 5
+    by_hand(writer, "s001", 1.5)
+    by_hand(writer, "s001", 2.5, "test_compute_gae")  # a teacher has overruled the judge
+    result = json.loads(exports.gradescope_json(one, writer.marks()["s001", "ch44"], penalty=1.0))
+    scores = {test["name"]: (test["score"], test["max_score"]) for test in result["tests"]}
+    assert scores == {"compute_gae": (2.5, 3.0), "td_residuals": (2.0, 2.0), "tradeoff": (1.5, 2.0)}
+    assert result["score"] == 5.0 and "1 points are taken off" in result["output"]
+    assert "1.5 / 2" in report_html(one, writer.marks()["s001", "ch44"])
+
+
+@pytest.mark.parametrize("status, provisional", [("needs_review", 4.0), ("infra_error", 0.0)])
+def test_gradescope_accepts_what_has_no_final_verdict(status, provisional):
+    """The format asks for a score, or for tests with scores; and points that are not final are not shown before they are published."""
+    result = json.loads(exports.gradescope_json(judged(scores={"compute_gae": 2.0}, status=status)))
+    assert "score" not in result and result["visibility"] == "after_published"
+    assert result["tests"] and all(isinstance(test["score"], float) for test in result["tests"])
+    assert sum(test["score"] for test in result["tests"]) == provisional
+    first = result["tests"][0]
+    assert (first["name"], first["max_score"], first["visibility"]) == ("submission", 0.0, "visible") and first["output"]
+
+
+def test_the_workbook_keeps_numbers_and_text_apart():
+    data = workbook({"grades": (("student", "score"), [("=1+1 <&>\x00", 7.5), ("ü", None)])})
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        sheet = ElementTree.fromstring(archive.read("xl/worksheets/sheet1.xml"))
+        names = {part.get("PartName") for part in ElementTree.fromstring(archive.read("[Content_Types].xml"))} - {None}
+        assert names == {"/xl/workbook.xml", "/xl/worksheets/sheet1.xml"} and archive.testzip() is None
+    ns = "{http://schemas.openxmlformats.org/spreadsheetml/2006/main}"
+    cells = {cell.get("r"): (cell.get("t"), "".join(cell.itertext())) for cell in sheet.iter(f"{ns}c")}
+    assert cells == {
+        "A1": ("inlineStr", "student"),
+        "B1": ("inlineStr", "score"),
+        "A2": ("inlineStr", "=1+1 <&>\ufffd"),
+        "B2": (None, "7.5"),
+        "A3": ("inlineStr", "ü"),
+    }
+    assert not list(sheet.iter(f"{ns}f"))
+    assert workbook({"grades": ((), [])}) == workbook({"grades": ((), [])})
 
 
 class _Page(HTMLParser):
@@ -185,7 +351,7 @@ def test_no_text_adds_markup_to_a_report(text):
 
 def test_a_report_says_every_state_in_words():
     page = _Page(report_html(every_state()))
-    for words in exports.STATE_WORDS.values():
+    for words in STATE_WORDS.values():
         assert words in page.text
     assert "0.5 of 5 points" in page.text
     assert "not graded yet, 2 points possible" in page.text
