@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 sys.modules.setdefault("rfc3987_syntax", cast(ModuleType, None))
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, help=__doc__)
-OK, LOW_SCORES, BAD_INPUT, BROKEN = 0, 1, 2, 3
+OK, LOW_SCORES, BAD_INPUT, BROKEN, LEFT_OVER = 0, 1, 2, 3, 4
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
@@ -144,12 +144,14 @@ def grade(
         typer.Option("--trust-submissions", help="Run WITHOUT a sandbox. For your own code only: it can do all that you can."),
     ] = False,
 ) -> None:
-    """Grade all submissions in a folder. Exit status: 0 all have a verdict, 1 below --fail-under, 2 bad input, 3 the grader failed."""
+    """Grade all submissions in a folder. Exit status: 0 all have a verdict, 1 below --fail-under, 2 bad input, 3 the grader
+    failed, 4 something in the folder was not understood; what was seen stands on standard error."""
     from sqlalchemy.exc import SQLAlchemyError
 
     from autograder import grade
     from autograder.grading import sandbox
 
+    left: list[str] = []
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     # away from a terminal it would leave an empty line
     with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
@@ -157,7 +159,7 @@ def grade(
         try:
             results = grade.grade(
                 submitted, out, jobs, scheduler, timeout, db_url, trust_submissions,
-                lambda done, total, name: bar.update(task, completed=done, total=total),
+                lambda done, total, name: bar.update(task, completed=done, total=total), left.append,
             )  # fmt: skip
         except (grade.GradingError, sandbox.SandboxUnavailable) as error:
             bar.stop()
@@ -172,11 +174,15 @@ def grade(
     for line in exports.same_files(verdicts.read_all(out / "verdicts")):  # also of students who are absent this time
         print(line)
     print(f"Grades are in {out}")
+    for line in left:
+        err.print(f"course: not understood: {line}", markup=False)
     if any(verdict.status == "infra_error" for verdict in results):
         _stop("some submissions could not be graded (infra_error): grade again; `course doctor` looks for the cause", BROKEN)
     low = [v for v in results if fail_under and (v.score < fail_under * v.max_score or not v.max_score)]
     if low:
         _stop(f"{len(low)} of {len(results)} submissions score under {fail_under:.0%}", LOW_SCORES)
+    if left:
+        _stop(f"the grades are written, but something in {submitted} was not understood (above)", LEFT_OVER)
 
 
 @app.command()

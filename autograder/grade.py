@@ -42,6 +42,7 @@ def grade(
     db_url: str | None = None,
     trusted: bool = False,
     progress: Callable[[int, int, str], None] = lambda done, total, name: None,
+    left_over: Callable[[str], None] = lambda line: None,
 ) -> list[Verdict]:
     """Grade `submitted/{student}/{assignment}/{assignment}.ipynb` into `out`.
 
@@ -54,11 +55,12 @@ def grade(
       db_url: nbgrader's gradebook, `sqlite:///out/gradebook.db` by default.
       trusted: no sandbox. For one's own code only.
       progress: called with (done, total, "student/assignment") after each submission.
+      left_over: called with a line for each thing in `submitted` that was not understood: what was seen, and what it would take.
 
     Returns: the verdicts of this run, sorted by student and assignment.
     Raises: GradingError if there is nothing to grade; sandbox.SandboxUnavailable if no sandbox can be had.
     """
-    tasks = _tasks(submitted)
+    tasks = _tasks(submitted, left_over)
     wanted = {assignment for _, assignment, _ in tasks} & judge.assignments()
     with ThreadPoolExecutor(1) as early:  # freezing the checks takes a second or two, in which the sandbox is tried
         for name in wanted:
@@ -134,13 +136,24 @@ def _infra_error(submission: intake.Submission, release: judge.Released, failure
     )
 
 
-def _tasks(submitted: Path) -> list[Task]:
+def _tasks(submitted: Path, left_over: Callable[[str], None]) -> list[Task]:
     if not submitted.is_dir():
         raise GradingError(f"{submitted}: no such folder. Give the folder that holds STUDENT/ASSIGNMENT/ASSIGNMENT.ipynb.")
-    tasks = intake.discover(submitted)
-    if not tasks:
-        raise GradingError(f"{submitted}: no submissions in it. Expected STUDENT/ASSIGNMENT/ASSIGNMENT.ipynb, nbgrader's layout.")
-    return tasks
+    survey = intake.survey(submitted, judge.assignments())
+    if survey.wrong_level or not survey.tasks:
+        seen = "".join(f"\n  {line}" for line in _few(survey.left_over))
+        raise GradingError(
+            f"{submitted}: no submissions in it. Expected STUDENT/ASSIGNMENT/ASSIGNMENT.ipynb, nbgrader's layout.{seen}"
+        )
+    for line in _few(survey.left_over):
+        left_over(line)
+    return survey.tasks
+
+
+def _few(lines: list[str]) -> list[str]:
+    lines = [" ".join(verdicts.clean_text(line, 500).split("\n")) for line in lines]  # file names, which may hold anything
+    more = len(lines) - intake.SHOWN
+    return lines if more <= 0 else [*lines[: intake.SHOWN], f"… and {more} more"]
 
 
 def _register(book: GradebookWriter, assignment: str, released: NotebookNode) -> None:
