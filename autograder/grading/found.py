@@ -146,7 +146,7 @@ def _in_folder(folder: Path, relative: str, rank: int) -> _Candidate:
 
 
 def _in_archives(folder: Path, seen: list[str], assignment: str, troubles: list[str]) -> list[_Candidate]:
-    found = []
+    found: list[_Candidate] = []
     for relative in [name for name in seen if name.casefold().endswith(".zip")][:3]:
         try:
             archive = archives.Archive(read_regular(folder / relative, archives.MAX_ARCHIVE))

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +58,7 @@ class Released:
     live_sources: frozenset[str]
     live_ids: frozenset[str]
     environment: str
-    form: repair.Form = repair.Form()
+    form: repair.Form = field(default_factory=repair.Form)
 
 
 _PREPARING = threading.Lock()

@@ -27,24 +27,7 @@ MAX_SKIPPED = 10_000_000
 MAX_DEPTH = 100
 UNREAD = {b'"outputs"', b'"attachments"', b'"widgets"'}
 LARGE = 20 << 20
-OTHER_LANGUAGES = {
-    "r",
-    "julia",
-    "octave",
-    "matlab",
-    "scala",
-    "javascript",
-    "typescript",
-    "java",
-    "c++",
-    "c#",
-    "sql",
-    "bash",
-    "sas",
-    "ruby",
-    "rust",
-    "go",
-}
+OTHER_LANGUAGES = frozenset("r julia octave matlab scala javascript typescript java c++ c# sql bash sas ruby rust go".split())
 
 # possessive throughout: a string of a hundred megabytes is passed without a stack
 _STRING = rb'"[^"\\]*+(?:\\.[^"\\]*+)*+"'
@@ -151,14 +134,14 @@ def not_json(content: bytes, line: int) -> str:
     if not content.lstrip().startswith(b"{"):
         return f"The file is not a notebook: a notebook is JSON and begins with a brace. {_NOTEBOOK_WANTED}."
     if not content.rstrip().endswith(b"}"):
-        return f"The notebook ends in the middle (valid JSON no further than line {line}): it is truncated. Save it again and hand it in again."
+        return f"The notebook ends in the middle (after line {line}): it is truncated. Save it again and hand it in again."
     return f"The notebook is not valid JSON (line {line}): it may be truncated or edited by hand. Save it again in Jupyter."
 
 
 # ---------------------------------------------------------------------------------------------------------------- text
 
 _MARKS = (
-    (codecs.BOM_UTF32_LE, "utf-32"),
+    (codecs.BOM_UTF32_LE, "utf-32"),  # before UTF-16's, with which it begins
     (codecs.BOM_UTF32_BE, "utf-32"),
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
@@ -171,11 +154,8 @@ def _utf8(content: bytes) -> bytes:
         return _checked(content[3:])
     encoding = next((name for mark, name in _MARKS if content.startswith(mark)), "")
     if not encoding and b"\0" in content[:4]:
-        pattern = tuple(byte != 0 for byte in content[:4])
-        encoding = {
-            (True, False, True, False): "utf-16-le", (False, True, False, True): "utf-16-be",
-            (True, False, False, False): "utf-32-le", (False, False, False, True): "utf-32-be",
-        }.get(pattern, "")  # fmt: skip
+        zeros = "".join(".0"[byte == 0] for byte in content[:4])
+        encoding = {".0.0": "utf-16-le", "0.0.": "utf-16-be", ".000": "utf-32-le", "000.": "utf-32-be"}.get(zeros, "")
     if not encoding:
         return _checked(content)
     try:
