@@ -103,7 +103,7 @@ def _because(troubles: list[str]) -> str:
 
 def _others(folder: Path, assignment: str, content: bytes) -> tuple[str, ...]:
     """Other files at its side that could be meant as well, for the teacher to know."""
-    found = []
+    found: list = []
     with os.scandir(folder) as scan:
         for number, entry in enumerate(scan):
             if number > 1000 or len(found) > MAX_CANDIDATES:

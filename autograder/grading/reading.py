@@ -27,7 +27,9 @@ MAX_SKIPPED = 10_000_000
 MAX_DEPTH = 100
 UNREAD = {b'"outputs"', b'"attachments"', b'"widgets"'}
 LARGE = 20 << 20
-OTHER_LANGUAGES = frozenset("r julia octave matlab scala javascript typescript java c++ c# sql bash sas ruby rust go".split())
+OTHER_LANGUAGES = frozenset(
+    ("r", "julia", "octave", "matlab", "scala", "javascript", "java", "c++", "c#", "sql", "bash", "sas", "ruby", "rust")
+)
 
 # possessive throughout: a string of a hundred megabytes is passed without a stack
 _STRING = rb'"[^"\\]*+(?:\\.[^"\\]*+)*+"'
@@ -107,10 +109,8 @@ def other_kind(content: bytes) -> str:
     if content.startswith(b"PK\x03\x04"):
         kind = "a Word file" if b"word/" in content else "a zip archive or an office document"
         return f"The file is {kind}, not a notebook. {_NOTEBOOK_WANTED}."
-    if (
-        lower.startswith((b"<!doctype html", b"<html", b"<head", b"<?xml", b"<svg"))
-        or b"<html" in lower[:500]
-        and lower[:1] == b"<"
+    if lower.startswith((b"<!doctype html", b"<html", b"<head", b"<?xml", b"<svg")) or (
+        lower[:1] == b"<" and b"<html" in lower[:500]
     ):
         return (
             "The file is a web page (HTML), not the notebook: the browser saved the page that shows it, or it was exported as HTML. "
