@@ -186,6 +186,36 @@ def grade(
 
 
 @app.command()
+def accept(
+    student: Annotated[str, typer.Argument(help="Whose submission, as `course grade` names it.")],
+    assignment: Annotated[str, typer.Argument(help="Which, as in ch44.")],
+    out: Annotated[Path, typer.Option(help="The folder that `course grade` wrote.")] = Path("grades"),
+    by: Annotated[str, typer.Option(help="Who says so; your login by default.")] = "",
+    because: Annotated[str, typer.Option(help="Why.")] = "",
+    db_url: Annotated[str | None, typer.Option(help="nbgrader's gradebook, as given to `course grade`.")] = None,
+) -> None:
+    """Make the provisional score of a submission that needs review final. It holds until another one is handed in."""
+    import getpass
+
+    from sqlalchemy.exc import SQLAlchemyError
+
+    from autograder import grade
+
+    if not by:
+        try:
+            by = getpass.getuser()
+        except (KeyError, OSError):  # a container without names
+            by = "somebody"
+    try:
+        verdict = grade.accept(student, assignment, out, by, because, db_url)
+    except (grade.GradingError, ValueError) as error:
+        _stop(error)
+    except (OSError, SQLAlchemyError) as error:
+        _stop(f"the grades cannot be written: {error}. What is written is whole; mend this and accept again.", BROKEN)
+    print(f"{verdict.student}/{verdict.assignment}: {verdict.score:g} of {verdict.max_score:g} is final, accepted by {by}")
+
+
+@app.command()
 def experiment(
     name: Annotated[str | None, typer.Argument(help="The experiment; without it, all are listed with their state.")] = None,
     seeds: Annotated[

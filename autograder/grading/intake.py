@@ -105,10 +105,11 @@ def _student(path: Path, submitted: Path, known: list[str], found_here: dict, le
     inside = list(_listed(path))
     folders = [entry for entry in inside if entry.is_dir()]
     loose = [entry for entry in inside if not entry.is_dir()]
-    left += [_loose(f"{path.name}/{entry.name}", Path(entry.path), known, path.name, path.name) for entry in loose]
     if not inside:
         left.append(f"{path.name}: an empty folder; expected {path.name}/{known[0] if known else 'ASSIGNMENT'}/…")
     meant = {entry.name: entry.name if entry.name in known else names.folder_for(entry.name, known) for entry in folders}
+    own = next((assignment for assignment in meant.values() if assignment), "ASSIGNMENT")
+    left += [_loose(f"{path.name}/{entry.name}", Path(entry.path), known, path.name, path.name, own) for entry in loose]
     is_class = False
     for entry in folders:
         assignment, folder = meant[entry.name], Path(entry.path)
@@ -170,9 +171,9 @@ def _assignment_inside(folder: Path, known: list[str]) -> str:
     return next((assignment for assignment in meant if assignment), "")
 
 
-def _loose(shown: str, path: Path, known: list[str], student: str, example: str) -> str:
+def _loose(shown: str, path: Path, known: list[str], student: str, example: str, own: str = "ASSIGNMENT") -> str:
     """A line for a file that lies where no submission does."""
-    assignment = names.assignment_of(path.name, known) or "ASSIGNMENT"
+    assignment = names.assignment_of(path.name, known) or own
     wanted = f"{example}/{assignment}/{assignment}.ipynb"
     if path.is_symlink() and not path.exists():
         return f"{shown}: a broken link"

@@ -2,7 +2,8 @@
 
 nbgrader's own tables and models (0.9.6) are used as they are; only the transactions are ours. Its API commits after every row, so
 that a kill leaves half a submission; here each submission is one transaction, and so is the creation of the database. What
-teachers type (manual scores, extra credit, comments, names, due dates) is never written. SQLite runs with a write-ahead log, in
+teachers type (manual scores, extra credit, comments, names, due dates) is never written. One table is ours, `course_accepted`: who made a
+provisional score final, when and why (`course accept`). SQLite runs with a write-ahead log, in
 which readers such as formgrader never block the writer; the log needs a local disk. Other databases work by their SQLAlchemy URL.
 """
 
@@ -11,6 +12,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +38,24 @@ from nbgrader.api import (
     SubmittedNotebook,
 )
 from nbgrader.dbutil import ALEMBIC_DIR
-from sqlalchemy import URL, and_, create_engine, delete, event, func, inspect, make_url, select, text, true
+from sqlalchemy import (
+    URL,
+    Column,
+    MetaData,
+    String,
+    Table,
+    Text,
+    and_,
+    create_engine,
+    delete,
+    event,
+    func,
+    inspect,
+    make_url,
+    select,
+    text,
+    true,
+)
 from sqlalchemy.orm import Session, aliased
 
 from autograder.grading.verdicts import Item, Verdict, plain_name, write_atomically
@@ -73,6 +92,31 @@ def _answer(notebook: NotebookNode | None, name: str) -> str | None:
     return passive.text(cell.source).strip() if cell else None
 
 
+@dataclass(frozen=True)
+class Acceptance:
+    """A person's word that the provisional score of one submission counts."""
+
+    student: str
+    assignment: str
+    submission: str
+    """Its fingerprint (see intake): another submission of the same student is not meant."""
+    accepted_by: str
+    accepted_on: str
+    reason: str
+
+
+_ACCEPTED = Table(
+    "course_accepted",
+    MetaData(),
+    Column("student", String(255), primary_key=True),
+    Column("assignment", String(255), primary_key=True),
+    Column("submission", String(64), nullable=False),
+    Column("accepted_by", Text, nullable=False),
+    Column("accepted_on", String(32), nullable=False),
+    Column("reason", Text, nullable=False),
+)
+
+
 # --- the database ------------------------------------------------------------------------------------------------------------
 
 
@@ -97,6 +141,7 @@ def _engine(db_url: str | URL):
 def _create_schema(connection) -> None:
     """What nbgrader's Gradebook does on its first visit, in one transaction and without a subprocess."""
     Base.metadata.create_all(connection)
+    _ACCEPTED.create(connection, checkfirst=True)
     if not inspect(connection).has_table("alembic_version"):
         config = Config()
         config.set_main_option("script_location", ALEMBIC_DIR.replace("%", "%%"))
@@ -237,6 +282,19 @@ class GradebookWriter:
                 else:
                     raise ValueError(f"{verdict.student}/{verdict.assignment}: the verdict has no item for {name!r}")
         return True
+
+    def accept(self, acceptance: Acceptance) -> None:
+        """Keep a person's word, in the place of an earlier one on the same student's assignment."""
+        key = and_(_ACCEPTED.c.student == acceptance.student, _ACCEPTED.c.assignment == acceptance.assignment)
+        with self._transaction() as db:
+            db.execute(delete(_ACCEPTED).where(key))
+            db.execute(_ACCEPTED.insert().values(**asdict(acceptance)))
+
+    def accepted(self, student: str, assignment: str) -> Acceptance | None:
+        """The last word on a student's assignment, whichever submission it was given on."""
+        with self._transaction() as db:
+            row = db.execute(select(_ACCEPTED).filter_by(student=student, assignment=assignment)).one_or_none()
+        return Acceptance(*row) if row else None
 
     @staticmethod
     def _submitted_notebook(db: Session, notebook: Notebook, student: str) -> SubmittedNotebook:
