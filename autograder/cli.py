@@ -120,11 +120,15 @@ def hub(folder: Annotated[Path, typer.Argument(help="A new or existing folder fo
 def check(notebook: Annotated[Path, typer.Argument(help="A student notebook.")]) -> None:
     """Run the visible checks of one notebook, in this process: for your own code."""
     from autograder import checks
-    from autograder.authoring import freeze
+    from autograder.authoring import assemble, chapter, freeze
     from course_lib.checks import client, command
 
     text = notebook.read_bytes().decode(errors="replace") if notebook.is_file() else ""  # what is wrong with it, `main` says
-    freeze.write([exercise for exercise in checks.all_exercises() if f"check({exercise.name})" in text], client.FROZEN)
+    asked = [exercise for exercise in checks.all_exercises() if f"check({exercise.name})" in text or f'"{exercise.name}"' in text]
+    freeze.write(asked, client.FROZEN)
+    for page in chapter.all_chapters():
+        outline = assemble.outline(page)
+        freeze.write_cells(outline.id, outline.exercises, outline.open_questions, client.FROZEN)
     raise typer.Exit(command.main([str(notebook)]))
 
 

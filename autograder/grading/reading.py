@@ -10,6 +10,7 @@ import codecs
 import json
 import re
 import threading
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,8 +22,8 @@ MAX_NOTEBOOK = 20 << 20
 """Bytes of what is left without them."""
 MAX_CELLS = 2000
 MAX_TOKENS = 1_000_000
-"""Brackets, braces and strings of what is left; an honest notebook has a string for each line."""
-MAX_SKIPPED = 10_000_000
+"""Brackets, braces and keys of what is left."""
+MAX_SKIPPED = 3_000_000
 """Brackets and braces of what is cut out."""
 MAX_DEPTH = 100
 UNREAD = {b'"outputs"', b'"attachments"', b'"widgets"'}
@@ -33,7 +34,9 @@ OTHER_LANGUAGES = frozenset(
 
 # possessive throughout: a string of a hundred megabytes is passed without a stack
 _STRING = rb'"[^"\\]*+(?:\\.[^"\\]*+)*+"'
-_TOKEN = re.compile(rb"(?P<string>" + _STRING + rb')(?P<key>\s*+:)?|[\[\]{}"]', re.DOTALL)
+_TOKEN = re.compile(  # the lines of a list in one piece; a string with its colon, if it is a key
+    rb"(?P<lines>(?:" + _STRING + rb"\s*+,\s*+)++)|(?P<string>" + _STRING + rb')(?P<key>\s*+:)?|[\[\]{}"]', re.DOTALL
+)
 _BRACKET = re.compile(rb'[^"\[\]{}]*+(?:' + _STRING + rb'[^"\[\]{}]*+)*+([\[\]{}])', re.DOTALL)
 _BLANK = re.compile(rb"\s*+")
 _one_large_file_at_a_time = threading.Lock()
@@ -194,7 +197,9 @@ def _without_outputs(text: bytes) -> bytes:
     while token := _TOKEN.search(text, position):
         tokens += 1
         position = token.end()
-        if token["string"] is None:
+        if token["lines"] is not None:
+            pass
+        elif token["string"] is None:
             if token[0] == b'"':  # a string without an end
                 break
             depth += 1 if token[0] in b"[{" else -1
@@ -265,8 +270,17 @@ def _converted(document: Any) -> Read:
         flags.append(f"ignored_cells: {len(entries) - len(cells)} of {len(entries)} have no type or source")
     if language := _language(document.get("metadata")):
         flags.append(f"other_kernel: {language}; its cells were run as Python")
-    plain = {"nbformat": 4, "nbformat_minor": 5, "metadata": {}, "cells": cells}
+    plain = {"nbformat": 4, "nbformat_minor": 5, "metadata": _version(document.get("metadata")), "cells": cells}
     return Read(nbformat.from_dict(plain), flags)
+
+
+def _version(metadata: Any) -> dict[str, Any]:
+    """Of the notebook's metadata, the version of Python that saved it, if it looks like one; it is only named, in a message."""
+    with suppress(AttributeError, KeyError, TypeError):
+        version = metadata["language_info"]["version"]
+        if re.fullmatch(r"\d\.\d{1,3}(\.\d{1,3})?[a-z\d+]{0,6}", version):
+            return {"language_info": {"name": "python", "version": version}}
+    return {}
 
 
 def _upgraded(document: dict[str, Any], version: int) -> dict[str, Any]:

@@ -93,6 +93,8 @@ def grade_id(cell: NotebookNode) -> str | None:
 
 def resembles(source: str, released: str) -> bool:
     """Whether at least half of the lines of `released` stand in `source`."""
+    if len(source) > 20 * len(released) + 10_000:
+        return False
     lines = [line for line in map(squeezed, released.splitlines()) if len(line) > 2]
     there = set(map(squeezed, source.splitlines()))
     return bool(lines) and sum(line in there for line in lines) >= len(lines) / 2
@@ -108,6 +110,10 @@ def defines(name: str) -> re.Pattern[str]:
     return re.compile(
         rf"^{prompt}(?:(?:async[ \t]+)?def[ \t]+{name}[ \t]*\(|class[ \t]+{name}\b|{name}[ \t]*(?::[^=\n]*)?=[^=])", re.MULTILINE
     )
+
+
+def _defined_in(source: str, name: str) -> bool:
+    return name in source and bool(defines(name).search(source))  # a long cell that never says the name costs next to nothing
 
 
 _STUB = re.compile(
@@ -126,9 +132,9 @@ class _Definition:
 
 def definitions(source: str, name: str, stub: str) -> list[_Definition]:
     """The definitions of `name` in a source, in order, by their lines; whether each is the stub as it was released."""
-    pattern = defines(name)
-    if not pattern.search(source):
+    if not _defined_in(source, name):
         return []
+    pattern = defines(name)
     lines, found = source.split("\n"), []
     for number, line in enumerate(lines):
         if not pattern.match(line):
@@ -176,6 +182,7 @@ class _Work:
     def __init__(self, notebook: NotebookNode, form: Form) -> None:
         self.form = form
         self.cells = [_copied(cell) for cell in notebook.cells]
+        self.metadata = {key: value for key, value in notebook.get("metadata", {}).items() if key == "language_info"}
         self.first: list[str] = []
         self.ambiguous: list[str] = []
         self._notes: dict[str, list[str]] = {}
@@ -194,7 +201,7 @@ class _Work:
             for what in _BY_LOSS:
                 notes.pop(what, None)
         flags += [f"repaired: {what} ({', '.join(dict.fromkeys(names))})" for what, names in notes.items()]
-        metadata = {FIRST: "\n\n".join(self.first)} if self.first else {}
+        metadata = self.metadata | ({FIRST: "\n\n".join(self.first)} if self.first else {})
         notebook = NotebookNode(nbformat=4, nbformat_minor=5, metadata=NotebookNode(metadata), cells=self.cells)
         return Repaired(notebook, flags, self.ambiguous)
 
@@ -230,7 +237,7 @@ class _Work:
                 self.note(_CHECK_TWICE, name)
 
     def _exercise_in(self, cell: NotebookNode) -> str | None:
-        return next((name for name in self.form.stubs if defines(name).search(cell.source)), None)
+        return next((name for name in self.form.stubs if _defined_in(cell.source, name)), None)
 
     def _merged(self, cell: NotebookNode) -> None:
         """Leave out, of an answer's cell, the lines that are a check's."""
@@ -272,7 +279,7 @@ class _Work:
 
     def _code_again(self, name: str) -> None:
         """An answer in a cell that became text is code again, if nothing but code is in it."""
-        in_code = any(cell.cell_type == "code" and defines(name).search(cell.source) for cell in self.cells)
+        in_code = any(cell.cell_type == "code" and _defined_in(cell.source, name) for cell in self.cells)
         for cell in self.cells:
             if cell.cell_type == "code" or (grade_id(cell) != name and (in_code or grade_id(cell) is not None)):
                 continue
