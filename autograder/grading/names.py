@@ -12,7 +12,7 @@ from autograder.grading.verdicts import clean_text, plain_name
 
 EXACT, NAMED, OTHER = range(3)  # how sure it is that a file is the notebook: by its name, by a part of it, by being one at all
 
-_NOTEBOOK = re.compile(r"(?P<stem>.+?)(?:\.ipynb)+(?:[._ -]?(?:json|txt|ipynb|download|\d+|copy))*", re.DOTALL)
+_NOTEBOOK = re.compile(r"(?P<stem>.+?)(?:\.ipynb)+(?:[._ -]?(?:json|txt|ipynb|download|copy|\(?\d+\)?))*", re.DOTALL)
 _JUNK = {"__macosx", "__pycache__", "thumbs.db", "desktop.ini"}
 _JUNK_FOLDERS = {"node_modules", "site-packages", "lightning_logs", "mlruns", "wandb", "tensorboard"}
 
@@ -75,7 +75,7 @@ def folder_for(name: str, assignments: Iterable[str]) -> str:
 
 
 _COPY = r"(?:(?:copy of|kopie von|copie de|copia de|kopia|cópia de|copia di|kopi av) )?"
-_AGAIN = r"(?:[ _-]*(?:\(\d+\)|\d|copy|kopie|copie|copia|kopia|cópia)[ _-]*(?:\(?\d+\)?)?)?"
+_AGAIN = r"(?:[ _-]*\(\d+\)|[ _-]+(?:\d|copy|kopie|copie|copia|kopia|cópia)(?:[ _-]*\(?\d+\)?)?)?"
 
 
 def _mentions(text: str, assignment: str) -> bool:

@@ -63,9 +63,24 @@ def complaints(cells: Sequence[Mapping[str, Any]], outline: Outline) -> dict[str
     Args:
       cells: all cells of the notebook file, as they stand in its JSON.
     """
+    marked = {_mark(cell) for cell in cells}
+    if not marked & {*outline.exercises, *outline.questions, *(f"test_{name}" for name in outline.exercises)}:
+        return {outline.exercises[0]: [_LOST]} if outline.exercises else {}
     found = {name: list(_of_exercise(name, cells)) for name in outline.exercises}
     found |= {name: list(_of_question(name, cells)) for name in outline.questions}
     return {name: lines for name, lines in found.items() if lines}
+
+
+_LOST = (
+    "The cells have lost their marks (nbgrader's metadata), as some editors and converters take them off: the grader finds functions by "
+    "their names and open answers by their questions, so leave both as they are."
+)
+
+
+def unchecked(cells: Sequence[Mapping[str, Any]], outline: Outline) -> list[str]:
+    """The exercises that have a cell in the notebook and no check."""
+    text = "\n".join(_text(cell) for cell in cells)
+    return [name for name in outline.exercises if _places(name, cells) and f"check({name})" not in text]
 
 
 def _of_exercise(name: str, cells: Sequence[Mapping[str, Any]]) -> Iterator[str]:
