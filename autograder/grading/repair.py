@@ -379,7 +379,7 @@ class _Work:
         return any(_contains(cell.source, _question(text)) for text in self.form.questions.values())
 
     def _by_text(self, released: str) -> list[NotebookNode]:
-        """Unmarked cells that hold the question's text, or else at least half of its lines."""
+        """Unmarked cells that hold the question's text, or else lines that are at least half of it."""
         free = [cell for cell in self.cells if grade_id(cell) is None and cell.source.strip() and not self._is_defining(cell)]
         question = _question(released)
         whole = [cell for cell in free if _contains(cell.source, question)]
@@ -502,4 +502,4 @@ def _solid(source: str) -> Iterator[int]:
 def _shares_lines(source: str, question: str) -> bool:
     text = squeezed(source)
     lines = [line for line in map(squeezed, question.splitlines()) if len(line) > 20]
-    return bool(lines) and sum(line in text for line in lines) > len(lines) / 2
+    return bool(lines) and sum(len(line) for line in lines if line in text) * 2 >= sum(map(len, lines))
