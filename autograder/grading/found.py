@@ -1,6 +1,7 @@
-"""Which file of a submission is its notebook: the one with the right name, or the only one that can be meant.
+"""Which file of a submission is its notebook: the one with the right name, or the only one whose name can mean it.
 
-Only names decide, never contents; but files with the same bytes are one. An archive is looked into if nothing else is there.
+Only names decide, never contents; but files with the same bytes are one. A notebook of another name is not taken for it. An archive is
+looked into if nothing else is there.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pathlib import Path
 
 from autograder.grading import archives, names, reading
 from autograder.grading.files import MAX_SIDE_BYTES, MAX_SIDE_FILES, BadFile, entries, read_regular
-from autograder.grading.names import EXACT, NAMED, OTHER
+from autograder.grading.names import EXACT, NAMED
 
 MAX_CANDIDATES = 8
 MAX_DEPTH = 4
@@ -64,12 +65,13 @@ def notebook(folder: Path, assignment: str) -> Notebook:
 
 def _the_one(candidates: list[_Candidate], assignment: str, troubles: list[str]) -> Notebook:
     wanted = f"There is no notebook {assignment}.ipynb in the submission"
-    likely = [one for one in candidates if one.rank <= NAMED] or candidates
+    likely = [one for one in candidates if one.rank <= NAMED]
     exact = [one for one in likely if one.rank == EXACT]
     if len(exact) == 1:
         likely = exact
     if not likely:
-        raise NotFound(f"{wanted}{_because(troubles)}.")
+        found = ", ".join(one.name for one in candidates[:3])
+        raise NotFound(f"{wanted}{f' (found: {found})' if found else _because(troubles)}.")
     shown = ", ".join(one.name for one in likely[:MAX_CANDIDATES]) + (", …" if len(likely) > MAX_CANDIDATES else "")
     contents: dict[str, tuple[_Candidate, bytes]] = {}
     for one in likely[:MAX_CANDIDATES]:
@@ -85,11 +87,6 @@ def _the_one(candidates: list[_Candidate], assignment: str, troubles: list[str])
             f"{wanted}, but several that could be meant: {shown}. Hand in the one that counts, under the name {assignment}.ipynb."
         )
     [(one, content)] = contents.values()
-    if one.rank == OTHER:
-        try:
-            reading.read(content)
-        except reading.BadNotebook as problem:
-            raise NotFound(f"{wanted} (found: {one.name}). {problem}") from None
     return one.take(content)
 
 
@@ -157,7 +154,7 @@ def _in_archives(folder: Path, seen: list[str], assignment: str, troubles: list[
             rank = _rank(entry.name, assignment)
             if rank is not None and entry.name.count("/") <= MAX_DEPTH:
                 found.append(_in_archive(relative, archive, entry, rank))
-        if not found:
+        if not any(one.rank <= NAMED for one in found):
             troubles.append(f"{relative} holds none either")
     return found
 

@@ -55,7 +55,7 @@ def read(folder):
         "ch44-Copy1.ipynb", "ch44 (1).ipynb", "ch44(2).ipynb", "ch44 2.ipynb", "ch44_final.ipynb", "Ada_ch44.ipynb", "ch44-ada-v2.ipynb",
         "ch44.ipynb.json", "ch44.ipynb.txt", "ch44.json", "ch44 (1).json", "ch44.ipynb.ipynb", "ch44.ipynb (1).json", "ch44.IPYNB",
         "CH44.ipynb",
-        " ch44.ipynb", "ch44 .ipynb", "ch44/ch44.ipynb", "ch44/Copy of ch44.ipynb", "a/b/ch44.ipynb", "homework.ipynb", "Untitled1.ipynb",
+        " ch44.ipynb", "ch44 .ipynb", "ch44/ch44.ipynb", "ch44/Copy of ch44.ipynb", "a/b/ch44.ipynb",
     ],
 )  # fmt: skip
 def test_the_only_candidate_counts_and_is_named(folder, name):
@@ -71,6 +71,16 @@ def test_a_name_without_the_assignment_gives_way_to_one_with_it(folder, name):
     put(folder / name, notebook("b = 2"))
     put(folder / "my ch44.ipynb")
     assert read(folder).flags == ["found_as: my ch44.ipynb"]
+
+
+@pytest.mark.parametrize("name", ["homework.ipynb", "Untitled1.ipynb", "ch440.ipynb", "ch43.ipynb"])
+def test_a_name_that_says_nothing_of_the_assignment_is_named_and_not_taken(folder, name):
+    put(folder / name)
+    submission = read(folder)
+    assert (
+        submission.notebook is None
+        and submission.problem == f"There is no notebook ch44.ipynb in the submission (found: {name})."
+    )
 
 
 def test_two_candidates_are_both_named(folder):
