@@ -141,7 +141,6 @@ def _engine(db_url: str | URL):
 def _create_schema(connection) -> None:
     """What nbgrader's Gradebook does on its first visit, in one transaction and without a subprocess."""
     Base.metadata.create_all(connection)
-    _ACCEPTED.create(connection, checkfirst=True)
     if not inspect(connection).has_table("alembic_version"):
         config = Config()
         config.set_main_option("script_location", ALEMBIC_DIR.replace("%", "%%"))
@@ -287,12 +286,15 @@ class GradebookWriter:
         """Keep a person's word, in the place of an earlier one on the same student's assignment."""
         key = and_(_ACCEPTED.c.student == acceptance.student, _ACCEPTED.c.assignment == acceptance.assignment)
         with self._transaction() as db:
+            _ACCEPTED.create(db.connection(), checkfirst=True)  # until then the database is as nbgrader makes it
             db.execute(delete(_ACCEPTED).where(key))
             db.execute(_ACCEPTED.insert().values(**asdict(acceptance)))
 
     def accepted(self, student: str, assignment: str) -> Acceptance | None:
         """The last word on a student's assignment, whichever submission it was given on."""
         with self._transaction() as db:
+            if not inspect(db.connection()).has_table(_ACCEPTED.name):
+                return None
             row = db.execute(select(_ACCEPTED).filter_by(student=student, assignment=assignment)).one_or_none()
         return Acceptance(*row) if row else None
 
