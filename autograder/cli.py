@@ -121,11 +121,15 @@ def hub(folder: Annotated[Path, typer.Argument(help="A new or existing folder fo
 def check(notebook: Annotated[Path, typer.Argument(help="A student notebook.")]) -> None:
     """Run the visible checks of one notebook, in this process: for your own code."""
     from autograder import checks
-    from autograder.authoring import freeze
+    from autograder.authoring import assemble, chapter, freeze
     from course_lib.checks import client, command
 
     text = notebook.read_bytes().decode(errors="replace") if notebook.is_file() else ""  # what is wrong with it, `main` says
-    freeze.write([exercise for exercise in checks.all_exercises() if f"check({exercise.name})" in text], client.FROZEN)
+    asked = [exercise for exercise in checks.all_exercises() if f"check({exercise.name})" in text or f'"{exercise.name}"' in text]
+    freeze.write(asked, client.FROZEN)
+    for page in chapter.all_chapters():
+        outline = assemble.outline(page)
+        freeze.write_cells(outline.id, outline.exercises, outline.open_questions, client.FROZEN)
     raise typer.Exit(command.main([str(notebook)]))
 
 
@@ -232,12 +236,14 @@ def grade(
         typer.Option("--trust-submissions", help="Run WITHOUT a sandbox. For your own code only: it can do all that you can."),
     ] = False,
 ) -> None:
-    """Grade all submissions in a folder. Exit status: 0 all have a verdict, 1 below --fail-under, 2 bad input, 3 the grader failed."""
+    """Grade all submissions in a folder. Exit status: 0 all have a verdict, 1 below --fail-under, 2 bad input, 3 the grader
+    failed, 4 something in the folder was not understood; what was seen stands on standard error."""
     from sqlalchemy.exc import SQLAlchemyError
 
     from autograder import grade
     from autograder.grading import sandbox
 
+    left: list[str] = []
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     # away from a terminal it would leave an empty line
     with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
@@ -245,7 +251,7 @@ def grade(
         try:
             results = grade.grade(
                 submitted, out, jobs, scheduler, timeout, db_url, trust_submissions,
-                lambda done, total, name: bar.update(task, completed=done, total=total), due=due,
+                lambda done, total, name: bar.update(task, completed=done, total=total), due, left.append,
             )  # fmt: skip
         except (grade.GradingError, sandbox.SandboxUnavailable) as error:
             bar.stop()
@@ -260,11 +266,46 @@ def grade(
     for line in exports.same_files(verdicts.read_all(out / "verdicts")):  # also of students who are absent this time
         print(line)
     print(f"Grades are in {out}")
+    for line in left:
+        err.print(f"course: not understood: {line}", markup=False)
     if any(verdict.status == "infra_error" for verdict in results):
         _stop("some submissions could not be graded (infra_error): grade again; `course doctor` looks for the cause", BROKEN)
     low = [v for v in results if fail_under and (v.score < fail_under * v.max_score or not v.max_score)]
     if low:
         _stop(f"{len(low)} of {len(results)} submissions score under {fail_under:.0%}", LOW_SCORES)
+    if left:
+        _stop(f"the grades are written, but something in {submitted} was not understood (above)", LEFT_OVER)
+
+
+@app.command()
+def accept(
+    student: Annotated[str, typer.Argument(help="Whose submission, as `course grade` names it.")],
+    assignment: Annotated[str, typer.Argument(help="Which, as in ch44.")],
+    out: Annotated[Path, typer.Option(help="The folder that `course grade` wrote.")] = Path("grades"),
+    by: Annotated[str, typer.Option(help="Who says so; your login by default.")] = "",
+    because: Annotated[str, typer.Option(help="Why.")] = "",
+    db_url: Annotated[str | None, typer.Option(help="nbgrader's gradebook, as given to `course grade`.")] = None,
+    due: Annotated[Path | None, typer.Option(help="Due dates, as given to `course grade`.")] = None,
+) -> None:
+    """Make the provisional score of a submission that needs review final. It holds until another one is handed in."""
+    import getpass
+
+    from sqlalchemy.exc import SQLAlchemyError
+
+    from autograder import grade
+
+    if not by:
+        try:
+            by = getpass.getuser()
+        except (KeyError, OSError):  # a container without names
+            by = "somebody"
+    try:
+        verdict = grade.accept(student, assignment, out, by, because, db_url, due)
+    except (grade.GradingError, ValueError) as error:
+        _stop(error)
+    except (OSError, SQLAlchemyError) as error:
+        _stop(f"the grades cannot be written: {error}. What is written is whole; mend this and accept again.", BROKEN)
+    print(f"{verdict.student}/{verdict.assignment}: {verdict.score:g} of {verdict.max_score:g} is final, accepted by {by}")
 
 
 class Platform(StrEnum):

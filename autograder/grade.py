@@ -6,27 +6,32 @@ are not in the folder keep what they have, and what a killed run left undone is 
 
 from __future__ import annotations
 
+import difflib
 import fcntl
+import json
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import nbformat
 from nbformat import NotebookNode
 
 from autograder.authoring import assemble, chapter
-from autograder.grading import deadlines, intake, judge, sandbox, sources, verdicts
+from autograder.grading import deadlines, intake, judge, names, sandbox, sources, verdicts
 from autograder.grading.deadlines import UNKNOWN, Deadlines, HandedIn, Rule
 from autograder.grading.verdicts import Verdict
 
 if TYPE_CHECKING:
-    from autograder.reporting.gradebook import GradebookWriter
+    from autograder.reporting.gradebook import Acceptance, GradebookWriter
 
 Task = tuple[str, str, Path]
 Judged = tuple[Verdict, NotebookNode | None]
+FINGERPRINT = "submission"  # key of a judged notebook's metadata
 ATTEMPTS = 2  # a submission whose sandbox failed on our side is tried once more
 
 
@@ -44,6 +49,7 @@ def grade(
     trusted: bool = False,
     progress: Callable[[int, int, str], None] = lambda done, total, name: None,
     due: Path | None = None,
+    left_over: Callable[[str], None] = lambda line: None,
 ) -> list[Verdict]:
     """Grade `submitted/{student}/{assignment}/{assignment}.ipynb` into `out`.
 
@@ -57,11 +63,12 @@ def grade(
       trusted: no sandbox. For one's own code only.
       progress: called with (done, total, "student/assignment") after each submission.
       due: due dates, see `grading.deadlines`; by default those in `submitted`, which `course collect` puts there.
+      left_over: called with a line for each thing in `submitted` that was not understood: what was seen, and what it would take.
 
     Returns: the verdicts of this run, sorted by student and assignment.
     Raises: GradingError if there is nothing to grade; sandbox.SandboxUnavailable if no sandbox can be had.
     """
-    tasks = _tasks(submitted)
+    tasks = _tasks(submitted, left_over)
     rules = _deadlines(submitted, due)
     wanted = {assignment for _, assignment, _ in tasks} & judge.assignments()
     with ThreadPoolExecutor(1) as early:  # freezing the checks takes a second or two, in which the sandbox is tried
@@ -103,7 +110,7 @@ def _write_all(
     gradebook.write_course(out, releases, db_url)
     folders = {(student, assignment): folder for student, assignment, folder in tasks}
     results = []
-    with gradebook.GradebookWriter(db_url or f"sqlite:///{(out / 'gradebook.db').resolve()}") as book:
+    with gradebook.GradebookWriter(db_url or _default_database(out)) as book:
         for name in {assignment for _, assignment, _ in tasks} & releases.keys():
             _register(book, name, releases[name], rules.rules.get(name))
         for verdict, notebook in judged:
@@ -130,7 +137,10 @@ def judge_folder(student: str, assignment: str, folder: Path, timeout: float, tr
     for _ in range(ATTEMPTS):
         try:
             submission = intake.read(student, assignment, folder)
-            return judge.judge(submission, release, timeout, trusted), submission.notebook
+            verdict = judge.judge(submission, release, timeout, trusted)
+            if submission.notebook is not None:
+                submission.notebook.metadata[FINGERPRINT] = submission.fingerprint
+            return verdict, submission.notebook
         except Exception as error:
             failure = error
     return _infra_error(submission, release, failure), submission.notebook
@@ -155,13 +165,24 @@ def _infra_error(submission: intake.Submission, release: judge.Released, failure
     )
 
 
-def _tasks(submitted: Path) -> list[Task]:
+def _tasks(submitted: Path, left_over: Callable[[str], None]) -> list[Task]:
     if not submitted.is_dir():
         raise GradingError(f"{submitted}: no such folder. Give the folder that holds STUDENT/ASSIGNMENT/ASSIGNMENT.ipynb.")
-    tasks = intake.discover(submitted)
-    if not tasks:
-        raise GradingError(f"{submitted}: no submissions in it. Expected STUDENT/ASSIGNMENT/ASSIGNMENT.ipynb, nbgrader's layout.")
-    return tasks
+    survey = intake.survey(submitted, judge.assignments())
+    if survey.wrong_level or not survey.tasks:
+        seen = "".join(f"\n  {line}" for line in _few(survey.left_over))
+        raise GradingError(
+            f"{submitted}: no submissions in it. Expected STUDENT/ASSIGNMENT/ASSIGNMENT.ipynb, nbgrader's layout.{seen}"
+        )
+    for line in _few(survey.left_over):
+        left_over(line)
+    return survey.tasks
+
+
+def _few(lines: list[str]) -> list[str]:
+    lines = [" ".join(verdicts.clean_text(line, 500).split("\n")) for line in lines]  # file names, which may hold anything
+    more = len(lines) - intake.SHOWN
+    return lines if more <= 0 else [*lines[: intake.SHOWN], f"… and {more} more"]
 
 
 def _handed_in(verdict: Verdict, folders: dict[tuple[str, str], Path], rules: Deadlines) -> tuple[HandedIn, Verdict]:
@@ -227,14 +248,126 @@ def _write(
     """Gradebook first, then the notebook that formgrader shows, then the verdict, which says that the rest is done."""
     from autograder.reporting import gradebook
 
+    pending = _pending(out, verdict.student, verdict.assignment)
     if verdict.assignment in releases:
+        verdict = _with_acceptance(verdict, notebook, book.accepted(verdict.student, verdict.assignment))
+        if verdict.status == "needs_review" and notebook is not None:
+            verdicts.write_atomically(pending, json.dumps(notebook, indent=1) + "\n")
         previous = gradebook.read_autograded(out, verdict.student, verdict.assignment)
         book.record(verdict, notebook, previous, handed_in)
         gradebook.write_autograded(out, releases[verdict.assignment], notebook, verdict)
         given, maximum = book.manual_scores(verdict.student, verdict.assignment)
         verdict = replace(verdict, manual_score=given, manual_max_score=maximum)
     verdicts.write(out / "verdicts", verdict)
+    if verdict.status != "needs_review":
+        pending.unlink(missing_ok=True)
     return verdict
+
+
+# -------------------------------------------------------------------------------- provisional scores made final
+
+
+def accept(
+    student: str,
+    assignment: str,
+    out: Path,
+    by: str,
+    because: str = "",
+    db_url: str | None = None,
+    due: Path | None = None,
+) -> Verdict:
+    """Make the provisional score of a submission that needs review final, and keep who did so, when and why.
+
+    It holds for this very submission: graded again unchanged it stays accepted, and another one of the same student is reviewed anew.
+
+    Args:
+      student, assignment: whose, and which.
+      out: the folder that `grade` wrote.
+      by, because: who says so, and why.
+      db_url, due: the gradebook and the due dates, as given to `grade`.
+
+    Returns: the final verdict.
+    Raises: GradingError, with what to do, if there is no provisional score.
+    """
+    from autograder.reporting import exports, gradebook
+
+    student = names.label(student)
+    if not (out / "verdicts").is_dir():
+        raise GradingError(f"{out}: no verdicts there. Give the folder that `course grade` wrote, by --out.")
+    with _one_run_at_a_time(out):
+        verdict, notebook = _provisional(out, student, assignment)
+        release = assemble.for_learners(chapter.load(assignment))
+        said = gradebook.Acceptance(
+            student,
+            assignment,
+            str(notebook.metadata.get(FINGERPRINT, "")),
+            verdicts.clean_text(by) or "somebody",
+            datetime.now(UTC).strftime("%Y-%m-%d"),
+            verdicts.clean_text(because),
+        )
+        with gradebook.GradebookWriter(db_url or _default_database(out)) as book:
+            _register(book, assignment, release)
+            book.accept(said)
+            verdict = _write(verdict, notebook, out, book, {assignment: release}, _in_time(verdict, out, due))
+            exports.write_all(out, book)
+    return verdict
+
+
+def _in_time(verdict: Verdict, out: Path, due: Path | None) -> HandedIn:
+    """When it came in, if what was graded into `out` is still there."""
+    for submitted in reversed(sources.read(out)):
+        folder = submitted / verdict.student / verdict.assignment
+        if folder.is_dir():
+            return _handed_in(verdict, {(verdict.student, verdict.assignment): folder}, _deadlines(submitted, due))[0]
+    return UNKNOWN
+
+
+def _provisional(out: Path, student: str, assignment: str) -> tuple[Verdict, NotebookNode]:
+    """The verdict that waits for a person, and the notebook that it is about."""
+    path = out / "verdicts" / student / f"{assignment}.json"
+    if not path.parent.is_dir():
+        known = sorted(one.name for one in (out / "verdicts").iterdir() if one.is_dir())
+        close = difflib.get_close_matches(student, known, 1)
+        raise GradingError(f"{out} has no verdict on a student {student!r}" + (f"; did you mean {close[0]!r}?" if close else "."))
+    if not path.is_file():
+        known = sorted(one.stem for one in path.parent.glob("[!.]*.json"))
+        raise GradingError(
+            f"{out} has no verdict on {student}'s {assignment!r}; there is one on {', '.join(known) or 'nothing'}."
+        )
+    verdict = verdicts.from_json(path.read_text(encoding="utf-8"))
+    where = f"{student}/{assignment}"
+    if verdict.status == "infra_error":
+        raise GradingError(f"{where} was not graded (infra_error): grade it again.")
+    if verdict.status != "needs_review":
+        raise GradingError(f"{where} is final already: {verdict.status}, {verdict.score:g} of {verdict.max_score:g}.")
+    pending = _pending(out, student, assignment)
+    if not pending.is_file():
+        raise GradingError(f"{where}: the notebook that waits for review is not in {pending.parent}: grade it again first.")
+    return verdict, nbformat.from_dict(json.loads(pending.read_text(encoding="utf-8")))
+
+
+def _pending(out: Path, student: str, assignment: str) -> Path:
+    """Where a notebook waits for a person's word."""
+    return out / "review" / student / f"{assignment}.ipynb"
+
+
+def _with_acceptance(verdict: Verdict, notebook: NotebookNode | None, said: Acceptance | None) -> Verdict:
+    """The verdict, final if a person has accepted this submission; flagged, if it was another one."""
+    if said is None or verdict.status == "infra_error":
+        return verdict
+    verdict = replace(verdict, flags=tuple(flag for flag in verdict.flags if not flag.startswith("acceptance_dropped: ")))
+    if notebook is None or notebook.metadata.get(FINGERPRINT) != said.submission:
+        dropped = f"acceptance_dropped: {said.accepted_by} accepted another submission on {said.accepted_on}"
+        return replace(verdict, flags=(dropped, *verdict.flags))
+    if verdict.status != "needs_review":
+        return verdict
+    because = f", because {said.reason}" if said.reason else ""
+    note = f"accepted: by {said.accepted_by} on {said.accepted_on}{because}"
+    return replace(verdict, status="graded", flags=(note, *verdict.flags))
+
+
+def _default_database(out: Path) -> str:
+    return f"sqlite:///{(out / 'gradebook.db').resolve()}"
 
 
 @contextmanager

@@ -16,6 +16,7 @@ import torch
 from autograder.authoring import artefacts, complaints
 from autograder.authoring.spec import Artefact, Case, Exercise
 from course_lib.checks import artefact as files
+from course_lib.checks import cells
 from course_lib.checks.cases import FrozenCase, FrozenExercise, Observation, save
 from course_lib.checks.diagnosis import differing_facets, signature, view, with_article
 from course_lib.checks.observing import observe
@@ -63,6 +64,15 @@ def write(exercises: Iterable[Exercise | Artefact], directory: Path) -> None:
             files.save(directory / f"{exercise.name}.json", artefacts.visible(exercise))
         else:
             save(directory / f"{exercise.name}.npz", visible(exercise))
+
+
+def write_cells(
+    assignment: str, exercises: Iterable[tuple[str, float]], questions: Iterable[tuple[str, float]], directory: Path
+) -> None:
+    """Write `directory/ASSIGNMENT.cells`, the names of an assignment's graded cells, by which a notebook is looked through."""
+    directory.mkdir(parents=True, exist_ok=True)
+    outline = cells.Outline(tuple(name for name, _ in exercises), tuple(name for name, _ in questions))
+    cells.save(directory, assignment, outline)
 
 
 def _exercise(exercise: Exercise, cases: list[FrozenCase]) -> FrozenExercise:

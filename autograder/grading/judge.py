@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ import course_lib
 from autograder import checks
 from autograder.authoring import artefacts, assemble, chapter, freeze
 from autograder.authoring.spec import Artefact
-from autograder.grading import flights, intake
+from autograder.grading import flights, intake, repair
 from autograder.grading.attempts import Attempt, Past, plan, share, suspect
 from autograder.grading.sandbox import Sandbox, SandboxDied, SandboxError, SandboxGarbage, SandboxTimeout, SandboxUnavailable
 from autograder.grading.verdicts import Item, Verdict, clean_text
@@ -58,6 +58,7 @@ class Released:
     live_sources: frozenset[str]
     live_ids: frozenset[str]
     environment: str
+    form: repair.Form = field(default_factory=repair.Form)
 
 
 _PREPARING = threading.Lock()
@@ -86,15 +87,17 @@ def _released(assignment: str) -> Released:
     names = {exercise.name for exercise in exercises}
     tests = {f"test_{name}" for name in names}
     questions = {name for name, _ in outline.open_questions}
-    live = [cell for cell in assemble.for_learners(page).cells if cell.cell_type == "code" and is_live(cell)]
+    notebook = assemble.for_learners(page)
+    live = [cell for cell in notebook.cells if cell.cell_type == "code" and is_live(cell)]
     return Released(
         assignment,
         exercises,
         tuple(outline.open_questions),
         frozenset(names | tests | questions),
-        frozenset(_squeezed(cell.source) for cell in live),
+        frozenset(repair.squeezed(cell.source) for cell in live),
         frozenset(cell.id for cell in live),
         environment(),
+        repair.form(notebook),
     )
 
 
@@ -115,7 +118,7 @@ def judge(submission: intake.Submission, release: Released, timeout: float = 60.
     """Grade one submission.
 
     Args:
-      submission: as read by intake; a submission without a notebook is a student_error.
+      submission: as read by intake; a submission without a notebook is a student_error. Its notebook is put right (see repair).
       release: the assignment.
       timeout: seconds for each exercise, and for loading the notebook.
       trusted: run without a sandbox; for one's own code only.
@@ -140,8 +143,9 @@ def judge(submission: intake.Submission, release: Released, timeout: float = 60.
         findings = [Finding(one.name, "not_implemented", 0.0, one.points, message=message) for one in release.exercises]
         status = "needs_review"
     else:
-        tampered = tampering(submission.notebook, release)
-        flags += tampered
+        repaired = repair.repair(submission.notebook, release.form)
+        submission.notebook = repaired.notebook
+        flags += repaired.ambiguous + repaired.flags
         run = _Run(submission, release, timeout, trusted)
         found = run.findings()
         flags += run.flags
@@ -154,7 +158,7 @@ def judge(submission: intake.Submission, release: Released, timeout: float = 60.
                 flags = receipts + flags  # first, as the list of flags is cut at its end
         findings = [found[exercise.name] for exercise in release.exercises]
         uncompared = any(flag.startswith(NOT_COMPARED) for flag in run.flags)
-        status = "needs_review" if tampered or uncompared else "graded"
+        status = "needs_review" if repaired.ambiguous or uncompared else "graded"
     items = [Item(f.exercise, f.score, f.max_score, f.state, tuple(f.misconceptions), clean_text(f.message)) for f in findings]
     items += [Item(name, 0.0, points, "manual") for name, points in release.open_questions]
     return Verdict.of(
@@ -182,20 +186,15 @@ def unknown_assignment(submission: intake.Submission) -> Verdict:
     )
 
 
-def tampering(notebook: Any, release: Released) -> list[str]:
-    """Released cells that are missing or stand twice; a person must look at such a notebook."""
-    found = intake.grade_ids(notebook)
-    missing = [f"missing_cell: {name}" for name in sorted(release.grade_ids) if not found[name]]
-    twice = [f"duplicate_cell: {name}" for name in sorted(release.grade_ids) if found[name] > 1]
-    return missing + twice
-
-
 def other_chapter(notebook: Any, release: Released) -> str:
-    """The assignment whose notebook this is, if it holds cells of that one and neither cells nor answers of `release`; else ""."""
+    """The assignment whose notebook this is, if it holds cells or answers of that one and none of `release`; else ""."""
     found = set(intake.grade_ids(notebook))
     cells = [(number, cell.source) for number, cell in enumerate(notebook.cells) if cell.cell_type == "code"]
-    if not found or found & release.grade_ids or any(_last_definition(one.name, cells) >= 0 for one in release.exercises):
+    if found & release.grade_ids or any(_last_definition(one.name, cells) >= 0 for one in release.exercises):
         return ""
+    if not any(found & ids for ids in _graded_names().values()):  # the marks may be lost
+        sources = [cell.source for cell in notebook.cells if len(cell.source) < MAX_TEXT]
+        found = {name for ids in _graded_names().values() for name in ids if any(f"def {name}(" in source for source in sources)}
     likeness = {name: len(found & ids) for name, ids in _graded_names().items()}
     return max((name for name in likeness if likeness[name]), key=lambda name: likeness[name], default="")
 
@@ -210,24 +209,47 @@ def _graded_names() -> dict[str, frozenset[str]]:
 
 
 def runnable(notebook: Any, release: Released) -> list[tuple[int, str]]:
-    """The (number, source) of the code cells that are the learner's to run: not the checks, and nothing that the release marks live."""
-    cells = []
-    for number, cell in enumerate((cell for cell in notebook.cells if cell.cell_type == "code"), start=1):
+    """The (number, source) of the code cells that are the learner's to run: not the checks, and nothing that the release marks live.
+
+    Cell 0 is what was put back or has to come first; of a cell, what repair says, if it says anything.
+    """
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    live = _released_live(code, release)
+    before = notebook.get("metadata", {}).get(repair.FIRST)
+    cells = [(0, before)] if before else []
+    for number, cell in enumerate(code, start=1):
+        source = cell.metadata.get(repair.AS_RUN, cell.source)
         is_answer = cell.metadata.get("nbgrader", {}).get("solution") is True
-        if is_answer or not (is_check(cell) or _is_released_live(cell, release)):
-            cells.append((number, cell.source))
+        if source is not None and (is_answer or not (is_check(cell) or number in live)):
+            cells.append((number, source))
     return cells
 
 
-def _is_released_live(cell: Any, release: Released) -> bool:
-    """A copy of a live cell keeps its tag, and may hold a learner's helpers: the tag counts only where the cells' ids are lost."""
-    if _squeezed(cell.source) in release.live_sources:
-        return True
-    return cell.id in release.live_ids if "id" in cell else is_live(cell)
+def _released_live(code: Sequence[Any], release: Released) -> set[int]:
+    """The numbers of the cells that were released as live, edited or not.
 
-
-def _squeezed(source: str) -> str:
-    return "".join(source.split())
+    A copy of one keeps its tag, and its id in some editors, and may hold a learner's helpers: only one cell is the released one.
+    Where ids are lost, it is the one that is most of it.
+    """
+    sources = [repair.squeezed(cell.source) for cell in code]
+    missing = [source for source in release.form.live.values() if repair.squeezed(source) not in sources]
+    live = {number for number, source in enumerate(sources, start=1) if source in release.live_sources}
+    taken = {code[number - 1].get("id") for number in live}
+    for number, cell in enumerate(code, start=1):
+        if number in live:
+            continue
+        if "id" in cell and cell.id in release.live_ids:
+            if cell.id not in taken:
+                taken.add(cell.id)
+                live.add(number)
+        elif "id" not in cell:
+            of = next((one for one in missing if repair.resembles(cell.source, one)), None)
+            if of is not None and (is_live(cell) or of.count("\n") > 3):
+                missing.remove(of)
+                live.add(number)
+            elif is_live(cell) and not release.form.live:
+                live.add(number)
+    return live
 
 
 class _Run:

@@ -122,6 +122,9 @@ def _library(chosen: list[Chapter], sources: Callable[[Chapter], Sources]) -> di
     with tempfile.TemporaryDirectory() as folder:
         for chapter in chosen:
             freeze.write(sources(chapter).exercises, Path(folder))
+            outline = assemble.outline(chapter, sources(chapter))
+            if outline.exercises or outline.open_questions:
+                freeze.write_cells(outline.id, outline.exercises, outline.open_questions, Path(folder))
         for path in sorted(Path(folder).iterdir()):
             files[f"course_lib/course_lib/frozen/{path.name}"] = path.read_bytes()
     for name in sorted({name for chapter in chosen for name in chapter.experiments}):

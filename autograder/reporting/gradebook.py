@@ -2,9 +2,10 @@
 
 nbgrader's own tables and models (0.9.6) are used as they are; only the transactions are ours. Its API commits after every row,
 so that a kill leaves half a submission; here each submission is one transaction, and so is the creation of the database. What
-teachers type (manual scores, extra credit, comments, names) is never written, due dates and penalties only from a file of them.
-SQLite runs with a write-ahead log, in which readers such as formgrader never block the writer; the log needs a local disk.
-Other databases work by their SQLAlchemy URL.
+teachers type (manual scores, extra credit, comments, names) is never written, due dates and penalties only from a file of them. One
+table is ours, `course_accepted`: who made a provisional score final, when and why (`course accept`). SQLite runs with a write-ahead
+log, in which readers such as formgrader never block the writer; the log needs a local disk. Other databases work by their SQLAlchemy
+URL.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,24 @@ from nbgrader.api import (
     SubmittedNotebook,
 )
 from nbgrader.dbutil import ALEMBIC_DIR
-from sqlalchemy import URL, and_, create_engine, delete, event, func, inspect, make_url, select, text, true
+from sqlalchemy import (
+    URL,
+    Column,
+    MetaData,
+    String,
+    Table,
+    Text,
+    and_,
+    create_engine,
+    delete,
+    event,
+    func,
+    inspect,
+    make_url,
+    select,
+    text,
+    true,
+)
 from sqlalchemy.orm import Session, aliased
 
 from autograder.grading.deadlines import UNKNOWN, HandedIn
@@ -75,6 +93,31 @@ def _is_open_question(cell: NotebookNode) -> bool:
 def _answer(notebook: NotebookNode | None, name: str) -> str | None:
     cell = graded_cells(notebook).get(name) if notebook else None
     return passive.text(cell.source).strip() if cell else None
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """A person's word that the provisional score of one submission counts."""
+
+    student: str
+    assignment: str
+    submission: str
+    """Its fingerprint (see intake): another submission of the same student is not meant."""
+    accepted_by: str
+    accepted_on: str
+    reason: str
+
+
+_ACCEPTED = Table(
+    "course_accepted",
+    MetaData(),
+    Column("student", String(255), primary_key=True),
+    Column("assignment", String(255), primary_key=True),
+    Column("submission", String(64), nullable=False),
+    Column("accepted_by", Text, nullable=False),
+    Column("accepted_on", String(32), nullable=False),
+    Column("reason", Text, nullable=False),
+)
 
 
 # --- the database ------------------------------------------------------------------------------------------------------------
@@ -261,6 +304,22 @@ class GradebookWriter:
                     raise ValueError(f"{verdict.student}/{verdict.assignment}: the verdict has no item for {name!r}")
             _note_time(db, paper, handed_in)
         return True
+
+    def accept(self, acceptance: Acceptance) -> None:
+        """Keep a person's word, in the place of an earlier one on the same student's assignment."""
+        key = and_(_ACCEPTED.c.student == acceptance.student, _ACCEPTED.c.assignment == acceptance.assignment)
+        with self._transaction() as db:
+            _ACCEPTED.create(db.connection(), checkfirst=True)  # until then the database is as nbgrader makes it
+            db.execute(delete(_ACCEPTED).where(key))
+            db.execute(_ACCEPTED.insert().values(**asdict(acceptance)))
+
+    def accepted(self, student: str, assignment: str) -> Acceptance | None:
+        """The last word on a student's assignment, whichever submission it was given on."""
+        with self._transaction() as db:
+            if not inspect(db.connection()).has_table(_ACCEPTED.name):
+                return None
+            row = db.execute(select(_ACCEPTED).filter_by(student=student, assignment=assignment)).one_or_none()
+        return Acceptance(*row) if row else None
 
     @staticmethod
     def _submitted_notebook(db: Session, notebook: Notebook, student: str) -> SubmittedNotebook:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from course_lib.checks.cases import FACET_TEXT, FrozenExercise, load
+from course_lib.checks.cells import notes
 from course_lib.checks.diagnosis import Finding, examine
 
 FROZEN = Path(__file__).parents[1] / "frozen"
@@ -35,6 +36,7 @@ class CheckResult:
         self.finding = finding
         self.passed = finding.state == "correct"
         self._praise = praise
+        self.notes: list[str] = []
         self._facets = facets
 
     def _headline(self) -> str:
@@ -42,7 +44,8 @@ class CheckResult:
 
     def _lines(self) -> list[str]:
         told = (self._praise if self.passed else self.finding.message).splitlines()
-        return [line for line in told if line.rstrip(".") != HEADLINES[self.finding.state]]  # which need not be said twice
+        told = [line for line in told if line.rstrip(".") != HEADLINES[self.finding.state]]  # which need not be said twice
+        return [*told, *self.notes]
 
     def _ticks(self) -> list[tuple[str, str]]:
         """The facets with a tick or a cross; once the values are wrong the others can't be told apart from it."""
@@ -85,6 +88,7 @@ def check(function: Callable) -> CheckResult:
     if not callable(function) or not isinstance(name, str):
         raise TypeError(f"check takes a function, as in check(compute_gae); it got {function!r:.80}")
     result = check_file(name) if is_judged_by_file(name) else _check_function(name, function)
+    result.notes = notes(name, FROZEN)
     if os.environ.get("NBGRADER_EXECUTION") == "validate" and not result.passed:
         raise AssertionError(repr(result))  # nbgrader's Validate button goes by exceptions alone
     return result

@@ -9,6 +9,8 @@ import os
 import sys
 from pathlib import Path
 
+from course_lib.checks import client
+from course_lib.checks.cells import all_cells, complaints, outline_of, outlines, unchecked
 from course_lib.checks.client import check, check_file, exercise_names, is_judged_by_file
 from course_lib.checks.notebook import NotebookError, code_cells, new_namespace, run_cells
 
@@ -24,8 +26,12 @@ def main(arguments: list[str]) -> int:
     except NotebookError as error:
         print(error, file=sys.stderr)
         return 2
+    outline = outline_of(everything := all_cells(path), outlines(client.FROZEN))
+    found = complaints(everything, outline) if outline else {}
     wanted = [name for name in exercise_names() if any(f"check({name})" in cell["source"] for cell in cells)]
     wanted.sort(key=lambda name: next(i for i, cell in enumerate(cells) if f"check({name})" in cell["source"]))
+    if outline:  # the grader also asks for those whose check cells are gone
+        wanted += [name for name in unchecked(everything, outline) if name in exercise_names()]
     if not wanted:
         print(f"{path}: no cell of this notebook checks an exercise of the course", file=sys.stderr)
         return 2
@@ -36,6 +42,8 @@ def main(arguments: list[str]) -> int:
     failures = run_cells(cells, namespace)
     for position, failure in failures.items():
         print(f"! code cell {position + 1} stopped: {type(failure).__name__}: {failure}")
+    for line in [line for lines in found.values() for line in lines]:
+        print(f"! {line}")
     passed = 0
     for name in wanted:
         if is_judged_by_file(name):

@@ -14,6 +14,7 @@ import itertools
 import json
 import math
 import os
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -178,14 +179,30 @@ def _show_live(series, title: str, x_label: str, initial: dict, sliders: dict) -
     from IPython.display import display
 
     def draw(**setting):
-        _figure(series(**setting), title, x_label)
-        plt.show()
+        try:
+            _figure(series(**setting), title, x_label)
+        except Exception as error:  # in a function of the learner's, above which stand thirty lines of widgets and of ours
+            print(_in_a_sentence(error))
+        else:
+            plt.show()
 
     controls = {
         name: widgets.SelectionSlider(options=list(choices), value=initial[name], description=name)
         for name, choices in sliders.items()
     }
     display(widgets.VBox([*controls.values(), widgets.interactive_output(draw, controls)]))
+
+
+def _in_a_sentence(error: Exception) -> str:
+    """Why there is no figure yet, and what to do."""
+    name = traceback.extract_tb(error.__traceback__)[-1].name
+    if isinstance(error, NotImplementedError):
+        return (
+            f"This figure shows what {name} returns, which is not written yet: write it, run its cell, then run this one again."
+        )
+    if isinstance(error, NameError):
+        return f"This figure needs a cell that has not run ({error}): run the cells above, then this one again."
+    return f"There is no figure, as {name} stops: {type(error).__name__}: {error}. Its check says more."
 
 
 def _show_recorded(series, title: str, x_label: str, initial: dict, sliders: dict) -> None:

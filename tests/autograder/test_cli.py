@@ -110,3 +110,25 @@ def test_long_runs_are_made_listed_and_kept(tmp_path, monkeypatch):
     assert failing.exit_code == 3 and "toy: 2 failed, 1 kept, 1 made." in failing.output and "b fails" in failing.output
     assert run("experiment", "tow").exit_code == 2 and "there are: toy" in run("experiment", "tow").output
     assert run("experiment", "toy", "--variant", "c").exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("score", "state", "arguments", "status"),
+    [
+        (5.0, "graded", [], 4),
+        (5.0, "infra_error", [], 3),
+        (4.0, "graded", ["--fail-under", "0.5"], 1),
+        (5.0, "graded", ["--fail-under", "0.5"], 4),
+    ],
+)
+def test_what_was_not_understood_is_named_and_has_an_exit_status_of_its_own(
+    tmp_path, monkeypatch, score, state, arguments, status
+):
+    def graded(*words, **_options):
+        words[-1]("ada/ch44.ipynb: a notebook outside an assignment's folder")
+        return [Verdict("s", "ch44", state, score * (state == "graded"), 10.0)]
+
+    monkeypatch.setattr(grade, "grade", graded)
+    monkeypatch.setattr(exports, "table", lambda _results: "")
+    result = run("grade", tmp_path, *arguments)
+    assert result.exit_code == status and "course: not understood: ada/ch44.ipynb: a notebook outside" in result.output

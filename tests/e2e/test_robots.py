@@ -143,11 +143,10 @@ def test_a_loop_and_an_exit_cost_their_exercises_alone_and_end_in_time(graded):
     assert result["seconds"] < (len(EXERCISES) + 1) * TIMEOUT + 15
 
 
-def test_a_tampered_notebook_is_for_a_person_to_see(graded):
+def test_a_check_that_was_deleted_is_put_back_and_said(graded):
     result = verdict(graded, "tampered")
-    assert result["status"] == "needs_review" and result["flags"] == ["missing_cell: test_compute_gae"]
+    assert result["status"] == "graded" and result["flags"] == ["repaired: checks were put back (test_compute_gae)"]
     assert result["score"] == 10.0
-    assert "tampered" not in [row["student_id"] for row in rows(graded / "grades.csv") if float(row["raw_score"])]
 
 
 def test_rewritten_points_and_checks_change_nothing(graded):

@@ -1,4 +1,4 @@
-"""Deletes the check cell of an exercise, with its points. Such a notebook goes to a person, and its score is provisional."""
+"""Deletes the check cell of an exercise, with its points. Checks and points come from the release: it is put back, and that is said."""
 
 from pathlib import Path
 

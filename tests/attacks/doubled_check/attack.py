@@ -1,4 +1,4 @@
-"""Duplicates a check cell, to be paid twice."""
+"""Duplicates a check cell, to be paid twice. Points come from the release: the copy is left out, and that is said."""
 
 import copy
 from pathlib import Path

@@ -1,5 +1,4 @@
-"""Hands in two answers under one name, the right one first: ambiguous, for a person to see. The last definition counts
-meanwhile."""
+"""Hands in two answers under one name, the right one first. The last definition counts, as for anything else, and that is said."""
 
 import copy
 from pathlib import Path

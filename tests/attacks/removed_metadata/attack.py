@@ -1,5 +1,4 @@
-"""Removes all of nbgrader's metadata, as some editors do. Never a graded zero: a person looks at it, and the answers are judged
-meanwhile."""
+"""Removes all of nbgrader's metadata, as some editors do. Never a graded zero: the answers are found by name and judged as ever."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Hands the notebook in under another name, with nothing under the right one: named, and zero points."""
+"""Hands the notebook in under a browser's name for a second download. It can be nothing else: it is graded, and that is said."""
 
 from pathlib import Path
 

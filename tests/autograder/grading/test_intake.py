@@ -8,7 +8,7 @@ import nbformat
 import pytest
 from nbformat.v4 import new_code_cell, new_notebook
 
-from autograder.grading import intake
+from autograder.grading import files, intake
 from autograder.grading.verdicts import plain_name
 
 GOOD = new_notebook(cells=[new_code_cell("a = 1", metadata={"nbgrader": {"grade_id": "f"}})])
@@ -89,7 +89,7 @@ def test_a_linked_folder_is_refused(tmp_path, folder):
 
 def test_a_huge_notebook_is_refused_unread(folder):
     with open(folder / "ch44.ipynb", "wb") as file:
-        file.truncate(intake.MAX_NOTEBOOK + 1)
+        file.truncate(intake.MAX_RAW + 1)
     assert "larger than" in intake.read("alice", "ch44", folder).problem
 
 
@@ -137,7 +137,7 @@ def test_a_long_name_in_a_deep_folder_is_ignored_and_flagged(folder):
 
 
 def test_more_entries_than_anybody_needs_are_not_counted(folder, monkeypatch):
-    monkeypatch.setattr(intake, "MAX_ENTRIES", 10)
+    monkeypatch.setattr(files, "MAX_ENTRIES", 10)
     put(folder, nbformat.writes(GOOD))
     for number in range(20):
         (folder / f"folder{number}").mkdir()

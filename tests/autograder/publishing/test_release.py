@@ -48,7 +48,7 @@ def test_a_bundle_has_notebooks_library_frozen_checks_and_a_readme(bundle):
     assert {"ch98/ch98.ipynb", "ch99/ch99.ipynb", "README.md", "course.zip", ".release.json"} <= files.keys()
     assert {"course_lib/pyproject.toml", "course_lib/course_lib/validate.py"} <= files.keys()
     frozen = {name for name in files if "/frozen/" in name}
-    assert frozen == {f"course_lib/course_lib/frozen/{name}.npz" for name in ("double", "quadruple")}
+    assert frozen == {f"course_lib/course_lib/frozen/{name}" for name in ("double.npz", "quadruple.npz", "ch99.cells")}
     assert b"`ch99/ch99.ipynb`: A tiny chapter: twice (90 minutes)" in files["README.md"]
     assert b"attachment:ch99-007-1.png" in files["ch99/ch99.ipynb"]
 

@@ -88,6 +88,40 @@ def test_live_notebook_gets_sliders_that_call_the_function(monkeypatch):
     assert called[0] == {"slope": 0.5, "kind": "up"} and called[-1] == {"slope": 2, "kind": "up"}
 
 
+def unwritten(slope):
+    raise NotImplementedError
+
+
+def needs_an_answer(slope, kind):
+    return {"ramp": Series(unwritten(slope))}
+
+
+def needs_a_cell(slope, kind):
+    return {"ramp": Series(cell_that_has_not_run)}  # noqa: F821
+
+
+def stops(slope, kind):
+    raise ValueError("shapes (3,) and (4,) differ")
+
+
+@pytest.mark.parametrize(
+    ("series", "says"),
+    [
+        (needs_an_answer, "This figure shows what unwritten returns, which is not written yet: write it, run its cell"),
+        (needs_a_cell, "This figure needs a cell that has not run (name 'cell_that_has_not_run' is not defined)"),
+        (stops, "There is no figure, as stops stops: ValueError: shapes (3,) and (4,) differ."),
+    ],
+)
+def test_an_explorer_that_cannot_draw_says_one_sentence(monkeypatch, capsys, series, says):
+    monkeypatch.delenv("COURSE_BOOK", raising=False)
+    monkeypatch.setattr("IPython.display.display", lambda _shown: None)
+    explore(series, title="T", x_label="x", **SLIDERS)
+    printed = capsys.readouterr()
+    shown = printed.out.replace("\x1b[2K\r", "")  # how a cell is cleared
+    assert shown.startswith(says) and shown.count("\n") == 1
+    assert "Traceback" not in printed.out + printed.err
+
+
 def test_a_start_that_no_slider_offers_is_refused():
     with pytest.raises(ValueError, match=r"start.*slope.*7"):
         explore(line, title="T", x_label="x", start={"slope": 7}, **SLIDERS)
