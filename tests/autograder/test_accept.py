@@ -235,3 +235,13 @@ def test_a_notebook_without_anything_can_be_accepted(course):
     course.grade()
     assert "no_exercise_found" in course.verdict()["flags"]
     assert course.accept().exit_code == 0 and course.verdict()["status"] == "graded"
+
+
+def test_an_accepted_submission_that_came_late_loses_what_the_rules_say(course):
+    course.hand_in()
+    (course.submitted / "ada" / "ch44" / "timestamp.txt").write_text("2026-11-22 12:00:00 UTC")
+    (course.submitted / ".due.yml").write_text(
+        "zone: UTC\npenalty: {per_day: 0.1, at_most: 0.5}\nassignments:\n  ch44: {due: 2026-11-21 12:00}\n"
+    )
+    course.grade()
+    assert course.accept().exit_code == 0 and course.row() == pytest.approx(4.5)
