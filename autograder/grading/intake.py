@@ -8,9 +8,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import stat
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -105,7 +107,7 @@ def parse(content: bytes) -> nbformat.NotebookNode:
         if len(document["cells"]) > MAX_CELLS:
             raise BadNotebook(f"The notebook has {len(document['cells'])} cells; at most {MAX_CELLS} are graded.")
         return nbformat.from_dict(
-            {"nbformat": 4, "nbformat_minor": 5, "metadata": {}, "cells": [_cell(c) for c in document["cells"]]}
+            {"nbformat": 4, "nbformat_minor": 5, "metadata": _language(document), "cells": [_cell(c) for c in document["cells"]]}
         )
     except BadNotebook:
         raise
@@ -115,6 +117,15 @@ def parse(content: bytes) -> nbformat.NotebookNode:
         raise BadNotebook(f"The notebook is not valid JSON (line {error.lineno}): it may be truncated. Save it again.") from None
     except Exception as error:  # a hostile document may break any converter in any way
         raise BadNotebook(f"The notebook is malformed ({type(error).__name__}). Open and save it in Jupyter.") from None
+
+
+def _language(document: Any) -> dict[str, Any]:
+    """Of the notebook's metadata, the version of Python that saved it, if it looks like one; it is only named, in a message."""
+    with suppress(AttributeError, KeyError, TypeError):
+        version = document["metadata"]["language_info"]["version"]
+        if re.fullmatch(r"\d\.\d{1,3}(\.\d{1,3})?[a-z\d+]{0,6}", version):
+            return {"language_info": {"name": "python", "version": version}}
+    return {}
 
 
 def _cell(cell: Any) -> dict[str, Any]:
