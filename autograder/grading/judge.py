@@ -33,7 +33,7 @@ from course_lib.checks.artefact import FrozenArtefact
 from course_lib.checks.cases import FrozenExercise, Observation, decode, encode
 from course_lib.checks.diagnosis import Finding, diagnose, view
 from course_lib.checks.names import WORD
-from course_lib.checks.notebook import Stop, is_check, is_live
+from course_lib.checks.notebook import NAMED, Stop, is_check, is_live
 from course_lib.checks.notebook import needed as needed_stops
 
 WORKER = Path(__file__).with_name("worker.py")
@@ -241,6 +241,9 @@ class _Run:
         self._cells, self._live = with_live(submission.notebook, release)
         own = [(number, "" if position in self._live else source) for position, (number, source) in enumerate(self._cells)]
         self._defined = {name: _last_definition(name, own) for name in self._exercises}
+        self._texts = (
+            [cell.source for cell in submission.notebook.cells if cell.cell_type != "code"] if submission.notebook else []
+        )
         self._saved_by = getattr(submission.notebook, "metadata", {}).get("language_info", {}).get("version", "")
         self._past = Past()
         self._found: dict[str, Finding] = {}
@@ -405,13 +408,21 @@ class _Run:
         for at in needed:
             stop = self._stopped[at]
             self._flag(f"cell_{self._cells[at][0]}_stopped: line {stop.line}, {stop.error}")
-        if finding.state != "error" or not needed:
+        if finding.state != "error":
             return finding
+        if not needed:
+            texts = [f"{name} stands in a text cell, which does not run: make it a code cell" for name in self._in_texts(finding)]
+            return replace(finding, message="; ".join([finding.message, *texts]))
         for at in needed:
             if newer := self._stopped[at].newer:
                 self._flag(f"{NEWER}: cell {self._cells[at][0]} needs {newer}, graded with {PYTHON}")
         causes = [self._cause(at) for at in needed[:MOST_CAUSES]]
         return replace(finding, message="; ".join([finding.message.removesuffix("."), *causes]))
+
+    def _in_texts(self, finding: Finding) -> list[str]:
+        """The names that the message misses and that a cell of text defines."""
+        missing = {name for found in NAMED.findall(finding.message) for name in found if name}
+        return [name for name in sorted(missing) if any(_last_definition(name, [(0, text)]) == 0 for text in self._texts)]
 
     def _cause(self, position: int) -> str:
         number, stop = self._cells[position][0], self._stopped[position]

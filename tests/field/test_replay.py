@@ -209,6 +209,14 @@ def helper_in_live(nb):
     nb.sum_is("my_sum(advantages, values)")
 
 
+@case(
+    7.0, says={"lambda_returns": "'my_sum' is not defined; my_sum stands in a text cell, which does not run: make it a code cell"}
+)
+def helper_in_text(nb):
+    next(one for one in nb.node.cells if one.cell_type == "markdown").source += "\n\ndef my_sum(a, b):\n    return a + b\n"
+    nb.sum_is("my_sum(advantages, values)")
+
+
 @case(7.0, says={"lambda_returns": "NameError: name 'trained' is not defined"})
 def a_value_that_a_live_cell_computes(nb):
     nb.live()[0].source += "\ntrained = sum([0.0])\n"
