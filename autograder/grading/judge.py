@@ -428,7 +428,9 @@ class _Run:
         number, stop = self._cells[position][0], self._stopped[position]
         if not stop.newer:
             return stop.said(number)
-        saved = f"Python {self._saved_by} saved the notebook" if self._saved_by else f"newer than {PYTHON}"
+        told = re.match(r"3\.(\d+)", self._saved_by)
+        newer = told is not None and int(told[1]) >= int(stop.newer.rpartition(".")[2])
+        saved = f"Python {self._saved_by} saved the notebook" if newer else f"newer than {PYTHON}"
         return (
             f"code cell {number} is written for Python {stop.newer} ({saved}), and this is graded with Python {PYTHON}: "
             f"a person will look at it ({stop.error})"
@@ -481,7 +483,7 @@ def _number(told: dict[str, Any]) -> int:
 def _stop(data: Any) -> Stop:
     seen = _mapping(data)
     line, error, newer = seen.get("line"), seen.get("error"), seen.get("newer")
-    if not (isinstance(line, int) and isinstance(error, str) and isinstance(newer, str) and len(newer) < 8):
+    if not (isinstance(line, int) and isinstance(error, str) and isinstance(newer, str) and re.fullmatch(r"(3\.\d\d)?", newer)):
         raise ValueError("the answer has something else where a cell's failure belongs")
     return Stop(line, error, tuple(map(str, _list(seen.get("sets")))), newer)
 

@@ -480,6 +480,7 @@ def install(namespace: dict[str, Any]) -> None:
     shell = shell_of(namespace)
     namespace["get_ipython"] = lambda: shell
     namespace |= {"_": "", "__": "", "___": "", "In": [""], "Out": {}, "exit": _stay, "quit": _stay, "input": _nobody_answers}
+    namespace |= {"_ih": namespace["In"], "_oh": namespace["Out"], "_dh": [os.getcwd()]}
     module = sys.modules.setdefault("IPython.core.getipython", types.ModuleType("IPython.core.getipython"))
     if not hasattr(module, "get_ipython") or module.get_ipython() is None:
         module.__dict__["get_ipython"] = _current

@@ -17,6 +17,7 @@ WORD = re.compile(r"[^\W\d]\w*")
 SETS = re.compile(
     r"^[ \t]*(?:(?:async[ \t]+)?(?:def|class)[ \t]+(\w+)|(\w+)[ \t]*=[^=]|(?:from|import)[ \t]+([^\n#]*))", re.MULTILINE
 )
+RUNS_A_FILE = ("get_ipython().run_line_magic('run'", "get_ipython().run_line_magic('pylab'")
 MOST = 500
 """Names of one cell or function; honest ones have a tenth of it."""
 
@@ -27,13 +28,15 @@ def words(source: str) -> set[str]:
 
 
 def set_by(statements: Sequence[ast.stmt]) -> set[str]:
-    """The names that these statements set where they stand."""
+    """The names that these statements set where they stand; "*" for those of a module or a file that is run."""
     names: set[str] = set()
     for node in at_this_level(statements):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             names.add(node.name)
         elif isinstance(node, ast.Import | ast.ImportFrom):
             names |= {alias.asname or alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.Call) and ast.unparse(node).startswith(RUNS_A_FILE):
+            names.add("*")
         elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
             names.add(node.id)
     return names

@@ -72,9 +72,10 @@ def run_definitions(source: str, namespace: dict[str, Any], name: str = "cell", 
 
 
 def wanted_of_live(live: Iterable[str], others: Iterable[str], namespace: dict[str, Any]) -> set[str]:
-    """The names that the other cells mention, and what the live cells' own definitions of them need in turn."""
-    shell = magics.shell_of(namespace)
-    return names.wanted_of([one for source in live for one in shell.statements(source)], others)
+    """The names that the other cells mention and do not set, and what the live cells' definitions of them need in turn."""
+    shell, others = magics.shell_of(namespace), list(others)
+    wanted = names.wanted_of([one for source in live for one in shell.statements(source)], others)
+    return wanted.difference(*(names_set_by(source, namespace) for source in others))
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,8 @@ NAMED = re.compile(r"name '(\w+)' is not defined|variable '(\w+)'|module '(\w+)"
 
 def needed(stops: Mapping[Any, Stop], exercise: str, uses: Iterable[str], message: str = "") -> list[Any]:
     """Which of the cells that stopped set what an exercise uses, or what its message misses; in order."""
-    wanted = {exercise, *uses, *(name for found in NAMED.findall(message) for name in found)}
+    missing = {name for found in NAMED.findall(message) for name in found if name}
+    wanted = {exercise, *uses, *missing} | ({"*"} if missing else set())
     return [key for key in sorted(stops) if wanted & set(stops[key].sets)]
 
 

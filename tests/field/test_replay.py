@@ -6,6 +6,7 @@ A case is a function of the perfect notebook of chapter 44, named as what it doe
 from __future__ import annotations
 
 import re
+import sys
 from types import SimpleNamespace
 
 import nbformat
@@ -231,32 +232,47 @@ def an_endless_live_cell_costs_nothing(nb):
 # ---------------------------------------------------------------- syntax
 
 
-NEW = "code cell 8 is written for Python 3.12 \\({}\\), and this is graded with Python 3.11: a person will look at it"
+def newer(version, saved=""):
+    """What must come out for an answer in the syntax of `version`: all points where this Python reads it."""
+    if sys.version_info >= tuple(map(int, version.split("."))):
+        return {}
+    message = (
+        f"code cell 8 is written for Python {version} \\({saved or f'newer than {judge.PYTHON}'}\\), and this is graded with"
+    )
+    message += f" Python {judge.PYTHON}: a person will look at it"
+    flags = ["cell_8_stopped: line [0-9]+, SyntaxError", f"newer_python: cell 8 needs {version}, graded with {judge.PYTHON}"]
+    return {
+        "score": 7.0,
+        "flags": flags,
+        "status": "needs_review",
+        "says": dict.fromkeys(("lambda_returns", "repaired_targets"), message),
+    }
 
 
-def _nested_quotes(nb):
-    nb.within("lambda_returns", 'text = f"shapes {", ".join(str(x.shape) for x in (advantages, values))}"')
+NESTED = 'text = f"shapes {", ".join(str(x.shape) for x in (advantages, values))}"'
 
 
-NEWER = {"score": 7.0, "flags": ["cell_8_stopped: line [0-9]+, SyntaxError", "newer_python: cell 8 needs 3.12, graded with 3.11"]}
-
-
-@case(
-    **NEWER, status="needs_review", says={name: NEW.format("newer than 3.11") for name in ("lambda_returns", "repaired_targets")}
-)
+@case(**newer("3.12"))
 def fstring_312(nb):
-    _nested_quotes(nb)
+    nb.within("lambda_returns", NESTED)
 
 
-@case(**NEWER, status="needs_review", says={"lambda_returns": NEW.format("Python 3.12.7 saved the notebook")})
+@case(**newer("3.12", "Python 3.12.7 saved the notebook"))
 def fstring_312_saved_by_312(nb):
-    _nested_quotes(nb)
+    nb.within("lambda_returns", NESTED)
     nb.node.metadata["language_info"] = {"name": "python", "version": "3.12.7"}
 
 
-@case(**NEWER, status="needs_review")
+@case(**newer("3.12"))
 def type_parameters(nb):
     nb.change("lambda_returns", "def lambda_returns(", "type Pair[T] = tuple[T, T]\n\n\ndef lambda_returns[T](")
+
+
+@case(**newer("3.14"))
+def exceptions_without_brackets(nb):
+    nb.change(
+        "lambda_returns", "    return", "    try:\n        pass\n    except ValueError, TypeError:\n        pass\n    return"
+    )
 
 
 @case(7.0, ["cell_8_stopped: line [0-9]+, SyntaxError"], {"lambda_returns": "SyntaxError"})
