@@ -108,8 +108,8 @@ def _cells_to_run(message: str) -> list[str]:
     """In Jupyter, the cells that were run and have not set a name that an answer misses."""
     module = sys.modules.get("IPython.core.getipython")
     shell = module.get_ipython() if module else None
-    history = shell.user_ns.get("In") if shell else None
-    if not isinstance(history, list):
+    history = shell.user_ns.get("In") if shell is not None else None
+    if shell is None or not isinstance(history, list):
         return []
     missing = [name for found in NAMED.findall(message) for name in found if name and name not in shell.user_ns]
     cells = {name: [number for number, source in enumerate(history) if name in roughly_set_by(source)] for name in missing}
