@@ -10,7 +10,8 @@ import builtins
 import functools
 import re
 import types
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 WORD = re.compile(r"[^\W\d]\w*")
@@ -20,11 +21,6 @@ SETS = re.compile(
 RUNS_A_FILE = ("get_ipython().run_line_magic('run'", "get_ipython().run_line_magic('pylab'")
 MOST = 500
 """Names of one cell or function; honest ones have a tenth of it."""
-
-
-def words(source: str) -> set[str]:
-    """All words of a source, also those of its comments."""
-    return set(WORD.findall(source))
 
 
 def set_by(statements: Sequence[ast.stmt]) -> set[str]:
@@ -57,19 +53,31 @@ def at_this_level(statements: Sequence[ast.AST]) -> Iterator[ast.AST]:
             waiting += ast.iter_child_nodes(node)
 
 
-def wanted_of(statements: Sequence[ast.stmt], sources: Iterable[str]) -> set[str]:
-    """The names that `sources` mention, and those that the statements mention which set one of them, and so on.
+def wanted_of(live: Sequence[ast.stmt], own: Sequence[ast.stmt]) -> set[str]:
+    """The names that `own` statements use and do not set, and those that the `live` ones use which set one of them, and so on.
 
     >>> live = ast.parse("import numpy as np; import seaborn; rows = 3\\ndef total(x):\\n    return np.sum(x)")
-    >>> sorted(wanted_of(live.body, ["answer = total(rows)"]) & {"np", "rows", "seaborn", "total"})
-    ['np', 'rows', 'total']
+    >>> own = ast.parse("answer = lambda seaborn: total(seaborn)  # not seaborn itself")
+    >>> sorted(wanted_of(live.body, own.body) - {"answer"})
+    ['np', 'total']
     """
-    wanted = set().union(*map(words, sources)) if sources else set()
-    left = [(set_by([statement]), words(ast.unparse(statement))) for statement in statements]
-    while found := [entry for entry in left if entry[0] & wanted]:
-        left = [entry for entry in left if not entry[0] & wanted]
-        wanted = wanted.union(*(mentioned for _, mentioned in found))
+    wanted = used_in(own) - set_by(own)
+    left = [(set_by([statement]), statement) for statement in live]
+    while found := [statement for names, statement in left if names & wanted]:
+        left = [(names, statement) for names, statement in left if not names & wanted]
+        wanted |= used_in(found)
     return wanted
+
+
+def used_in(statements: Sequence[ast.stmt]) -> set[str]:
+    """The names that these statements and the functions in them take from the notebook."""
+    used: set[str] = set()
+    for statement in statements:
+        with suppress(SyntaxError, ValueError, RecursionError):
+            flags = ast.PyCF_ALLOW_TOP_LEVEL_AWAIT
+            code = compile(ast.Module([statement], []), "", "exec", flags, dont_inherit=True)
+            used.update(_global_names(code))
+    return used
 
 
 def used_by(function: Any, namespace: Mapping[str, Any]) -> list[str]:

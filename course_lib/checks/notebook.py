@@ -72,10 +72,10 @@ def run_definitions(source: str, namespace: dict[str, Any], name: str = "cell", 
 
 
 def wanted_of_live(live: Iterable[str], others: Iterable[str], namespace: dict[str, Any]) -> set[str]:
-    """The names that the other cells mention and do not set, and what the live cells' definitions of them need in turn."""
-    shell, others = magics.shell_of(namespace), list(others)
-    wanted = names.wanted_of([one for source in live for one in shell.statements(source)], others)
-    return wanted.difference(*(names_set_by(source, namespace) for source in others))
+    """The names that the other cells use and do not set, and what the live cells' definitions of them need in turn."""
+    shell = magics.shell_of(namespace)
+    defined, own = ([one for source in sources for one in shell.statements(source)] for sources in (live, others))
+    return names.wanted_of(defined, own)
 
 
 @dataclass(frozen=True)
