@@ -622,7 +622,7 @@ def _environment(line: str) -> Any:
 
 def _existing(name: str) -> Path:
     path = Path(name).expanduser()
-    return path if path.exists() else Path(f"{path}.py")
+    return path if path.exists() or path.suffix in (".py", ".ipynb", ".ipy") else Path(f"{path}.py")
 
 
 def _sources(path: Path) -> list[str]:

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -189,3 +190,17 @@ def test_the_command_prints_in_any_encoding(tmp_path, frozen, encoding, passed):
     path = notebook(tmp_path, right, "check(lambda_returns)", "raise ValueError('λ…\\udc80')")
     told = command([str(path)], frozen, PYTHONIOENCODING=encoding, PYTHONUTF8="0", LC_ALL="C")
     assert told.returncode == 0 and passed in told.stdout and "1 of 1 pass" in told.stdout and not told.stderr
+
+
+@pytest.mark.parametrize(
+    ("message", "told"),
+    [
+        ("It raises NameError: name 'sns' is not defined", ["In[2] was to set sns: run it again, and look where it stops"]),
+        ("It raises NameError: name 'other' is not defined", []),
+        ("It raises NameError: name 'torch' is not defined", []),
+    ],
+)
+def test_in_jupyter_the_cell_that_was_to_set_a_missing_name_is_named(monkeypatch, message, told):
+    shell = SimpleNamespace(user_ns={"In": ["", "sns = 1", "import nothing\nimport seaborn as sns\nimport torch"], "torch": 1})
+    monkeypatch.setitem(sys.modules, "IPython.core.getipython", SimpleNamespace(get_ipython=lambda: shell))
+    assert client._cells_to_run(message) == told
