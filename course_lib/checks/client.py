@@ -108,9 +108,9 @@ def _cells_to_run(message: str) -> list[str]:
     """In Jupyter, the cells that were run and have not set a name that an answer misses."""
     module = sys.modules.get("IPython.core.getipython")
     shell = module.get_ipython() if module else None
-    history = shell.user_ns.get("In") if shell is not None else None
-    if shell is None or not isinstance(history, list):
+    if shell is None or getattr(shell, "kernel", None) is None:  # not Jupyter, but our own, which knows what stopped
         return []
+    history = shell.user_ns["In"]
     missing = [name for found in NAMED.findall(message) for name in found if name and name not in shell.user_ns]
     cells = {name: [number for number, source in enumerate(history) if name in roughly_set_by(source)] for name in missing}
     return [

@@ -201,6 +201,8 @@ def test_the_command_prints_in_any_encoding(tmp_path, frozen, encoding, passed):
     ],
 )
 def test_in_jupyter_the_cell_that_was_to_set_a_missing_name_is_named(monkeypatch, message, told):
-    shell = SimpleNamespace(user_ns={"In": ["", "sns = 1", "import nothing\nimport seaborn as sns\nimport torch"], "torch": 1})
+    shell = SimpleNamespace(
+        kernel=1, user_ns={"In": ["", "sns = 1", "import nothing\nimport seaborn as sns\nimport torch"], "torch": 1}
+    )
     monkeypatch.setitem(sys.modules, "IPython.core.getipython", SimpleNamespace(get_ipython=lambda: shell))
     assert client._cells_to_run(message) == told
