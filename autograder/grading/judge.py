@@ -412,6 +412,8 @@ class _Run:
             return finding
         if not needed:
             texts = [f"{name} stands in a text cell, which does not run: make it a code cell" for name in self._in_texts(finding)]
+            for text in texts:
+                self._flag(f"text_cell: {text}")
             return replace(finding, message="; ".join([finding.message, *texts]))
         for at in needed:
             if newer := self._stopped[at].newer:
