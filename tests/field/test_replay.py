@@ -210,9 +210,10 @@ def helper_in_live(nb):
     nb.sum_is("my_sum(advantages, values)")
 
 
-@case(
-    7.0, says={"lambda_returns": "'my_sum' is not defined; my_sum stands in a text cell, which does not run: make it a code cell"}
-)
+MARKED = "my_sum stands in a text cell, which does not run: make it a code cell"
+
+
+@case(7.0, [f"text_cell: {MARKED}"], {"lambda_returns": f"'my_sum' is not defined; {MARKED}"})
 def helper_in_text(nb):
     next(one for one in nb.node.cells if one.cell_type == "markdown").source += "\n\ndef my_sum(a, b):\n    return a + b\n"
     nb.sum_is("my_sum(advantages, values)")
