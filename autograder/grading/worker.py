@@ -21,6 +21,7 @@ import select
 import signal
 import socket
 import sys
+import threading
 from contextlib import suppress
 from dataclasses import asdict
 
@@ -87,7 +88,9 @@ def load(channel: Channel, cells: list) -> dict:
 
 
 def pools_left() -> list:
-    """The pools of threads and processes that the cells have made."""
+    """The pools of threads and processes that the cells have made and used: those have threads."""
+    if threading.active_count() == 1:
+        return []
     places = {"concurrent.futures.thread": "ThreadPoolExecutor", "concurrent.futures.process": "ProcessPoolExecutor"}
     places["multiprocessing.pool"] = "Pool"  # and its ThreadPool
     kinds = tuple(getattr(sys.modules[module], name) for module, name in places.items() if module in sys.modules)
