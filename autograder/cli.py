@@ -497,6 +497,10 @@ def doctor() -> None:
 
 def main() -> None:
     """Entry point of the console script."""
+    if (sys.stdout.encoding or "").lower() not in ("utf-8", "utf8"):
+        from course_lib.checks.terminal import print_anything
+
+        print_anything()
     app()
 
 

@@ -16,30 +16,16 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
+from course_lib.checks.packages import LEARNER_PACKAGES
+
 MiB = 1 << 20
 NOBODY = "65534"
 APART = ("--unshare-net", "--unshare-ipc", "--unshare-uts", "--hostname", "sandbox")
 LIBRARY_CACHE = ("--ro-bind-try", "/etc/ld.so.cache", "/etc/ld.so.cache")
 
-# What a learner may import, beside course_lib. Their requirements come with them; nothing else that is installed does.
-LEARNER_PACKAGES = (
-    "torch",
-    "numpy",
-    "matplotlib",
-    "ipython",
-    "ipywidgets",
-    "gymnasium[box2d,mujoco]",
-    "pyarrow",
-    "safetensors",
-    "threadpoolctl",
-    "tqdm",
-    "transformers",
-    "vaderSentiment",
-)
-
 ENVIRONMENT = {
     "HOME": "/work", "MPLBACKEND": "Agg", "MPLCONFIGDIR": "/tmp", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1",
-    "PYTHONHASHSEED": "0", "PYTHONUTF8": "1",
+    "PYTHONHASHSEED": "0", "PYTHONUTF8": "1", "TORCHDYNAMO_DISABLE": "1",  # no compiler inside: torch.compile is eager
 }  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import re
+import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -31,7 +32,9 @@ from autograder.paths import ROOT
 from course_lib.checks.artefact import FrozenArtefact
 from course_lib.checks.cases import FrozenExercise, Observation, decode, encode
 from course_lib.checks.diagnosis import Finding, diagnose, view
-from course_lib.checks.notebook import is_check, is_live
+from course_lib.checks.names import WORD
+from course_lib.checks.notebook import NAMED, Stop, is_check, is_live
+from course_lib.checks.notebook import needed as needed_stops
 
 WORKER = Path(__file__).with_name("worker.py")
 COURSE_LIB = Path(course_lib.__file__).parent
@@ -40,6 +43,9 @@ GRACE_SECONDS = 5.0  # how much longer the judge waits than the worker's own tim
 MAX_TEXT = 4 << 20  # bytes of a worker's answer that are not numbers; honest ones have a hundredth of it
 SLACK_SECONDS = 10.0  # for starting sandboxes, on top of (exercises + 1) * timeout
 NOT_COMPARED = "could_not_compare"  # begins the flag of an answer that our comparison did not survive
+NEWER = "newer_python"  # begins the flag of a cell whose syntax this Python does not know
+PYTHON = f"{sys.version_info.major}.{sys.version_info.minor}"
+MOST_CAUSES = 3  # that a message names
 ENDINGS = {"did_not_finish": ("timeout", "did not finish in time"), "ended_the_process": ("error", "ended its process")}
 
 
@@ -157,7 +163,7 @@ def judge(submission: intake.Submission, release: Released, timeout: float = 60.
                 timings[artefact.name] = round(time.monotonic() - began, 3)
                 flags = receipts + flags  # first, as the list of flags is cut at its end
         findings = [found[exercise.name] for exercise in release.exercises]
-        uncompared = any(flag.startswith(NOT_COMPARED) for flag in run.flags)
+        uncompared = any(flag.startswith((NOT_COMPARED, NEWER)) for flag in run.flags)
         status = "needs_review" if repaired.ambiguous or uncompared else "graded"
     items = [Item(f.exercise, f.score, f.max_score, f.state, tuple(f.misconceptions), clean_text(f.message)) for f in findings]
     items += [Item(name, 0.0, points, "manual") for name, points in release.open_questions]
@@ -260,11 +266,17 @@ class _Run:
         self.timings: dict[str, float] = {}  # exercise → seconds spent in asking for it
         self._submission, self._timeout, self._trusted = submission, timeout, trusted
         self._exercises = {one.name: one for one in release.exercises if isinstance(one, FrozenExercise)}
-        self._cells = runnable(submission.notebook, release)
-        self._defined = {name: _last_definition(name, self._cells) for name in self._exercises}
+        self._cells, self._live = with_live(submission.notebook, release)
+        own = [(number, "" if position in self._live else source) for position, (number, source) in enumerate(self._cells)]
+        self._defined = {name: _last_definition(name, own) for name in self._exercises}
+        self._texts = (
+            [cell.source for cell in submission.notebook.cells if cell.cell_type != "code"] if submission.notebook else []
+        )
+        self._saved_by = getattr(submission.notebook, "metadata", {}).get("language_info", {}).get("version", "")
         self._past = Past()
         self._found: dict[str, Finding] = {}
-        self._stopped: dict[str, str] = {}  # number of a cell → what it raised
+        self._stopped: dict[int, Stop] = {}  # position of a cell → what it raised first
+        self._uses: dict[str, frozenset[str]] = {}  # exercise → the names of the notebook that its function uses
         self._troubles: dict[int, str] = {}  # position of a lost cell → how it was lost
         self._deadline = time.monotonic() + (len(self._exercises) + 1) * timeout + SLACK_SECONDS
 
@@ -277,7 +289,10 @@ class _Run:
                 self._wait_until_ready(sandbox)
                 if self._left() > 0 and self._load(sandbox, attempt):
                     self._ask_all(sandbox, attempt)
-        return {name: self._found.get(name) or self._never_asked(exercise) for name, exercise in self._exercises.items()}
+        return {
+            name: self._with_causes(self._found.get(name) or self._never_asked(exercise))
+            for name, exercise in self._exercises.items()
+        }
 
     @contextmanager
     def _sandbox(self) -> Iterator[Sandbox]:
@@ -325,21 +340,27 @@ class _Run:
         numbers = {self._cells[position][0]: position for position in positions}
         until = time.monotonic() + share(self._left(), attempt.loading_spares, self._timeout)
         try:
-            cells = [[*self._cells[position], position in attempt.whole] for position in positions]
+            cells = [[*self._cells[position], self._how(position, attempt)] for position in positions]
             sandbox.send(encode({"cells": cells}), max(until - time.monotonic(), 0.01))
             while time.monotonic() < until:
                 told = _told(sandbox, max(until - time.monotonic(), 0.01))
                 if "loaded" in told:
-                    self._stopped = {str(number): str(text) for number, text in _mapping(told["loaded"]).items()}
+                    stops = {numbers[int(number)]: _stop(said) for number, said in _mapping(told["loaded"]).items()}
+                    self._stopped = {at: stop for at, stop in self._stopped.items() if at not in positions} | stops
                     return True
                 running = numbers.get(_number(told), running)
             raise SandboxTimeout("the cells are not done in time")
-        except (SandboxError, ValueError) as error:
+        except (SandboxError, ValueError, KeyError) as error:
             trouble = "did_not_finish" if isinstance(error, SandboxTimeout) else "ended_the_process"
             self._troubles[running] = trouble
             self._flag(f"cell_{self._cells[running][0]}_{trouble}")
             self._happened(lost=(*self._past.lost, running))
             return False
+
+    def _how(self, position: int, attempt: Attempt) -> str:
+        if position in self._live:
+            return "live"
+        return "whole" if position in attempt.whole else "definitions"
 
     # ------------------------------------------------------------------ asking for the exercises
 
@@ -373,6 +394,7 @@ class _Run:
         sandbox.send(encode({"exercise": exercise.name, "seconds": seconds, "cases": cases}), GRACE_SECONDS)
         told = _told(sandbox, min(seconds + GRACE_SECONDS, max(self._left(), 0.1) + 1))
         if "observations" in told:
+            self._uses[exercise.name] = frozenset(map(str, _list(told.get("uses", []))))
             return self._compared(exercise, _observations(told["observations"], exercise))
         if told.get("missing"):
             return self._missing(exercise)
@@ -393,9 +415,8 @@ class _Run:
         where = self._defined[exercise.name]
         if where in self._troubles:
             return self._lost_with_its_cell(exercise)
-        number = str(self._cells[where][0]) if where >= 0 else ""
-        if number in self._stopped:
-            return _failed(exercise, "error", f"Code cell {number}, which defines it, stops: {self._stopped[number]}")
+        if where in self._stopped:
+            return _failed(exercise, "error", "The cell that defines it stops before.")
         return _failed(exercise, "not_implemented", f"The notebook defines no function {exercise.name}.")
 
     def _lost_with_its_cell(self, exercise: FrozenExercise) -> Finding:
@@ -408,11 +429,63 @@ class _Run:
             return self._missing(exercise)
         return self._timed_out(exercise)
 
+    def _with_causes(self, finding: Finding) -> Finding:
+        """The finding, naming the cells that stopped and that the answer needs; they become flags, too."""
+        where = self._defined[finding.exercise]
+        uses = self._uses.get(finding.exercise) or frozenset(WORD.findall(self._cells[where][1]) if where >= 0 else ())
+        needed = needed_stops(self._stopped, finding.exercise, uses, finding.message)
+        for at in needed:
+            stop = self._stopped[at]
+            self._flag(f"cell_{self._cells[at][0]}_stopped: line {stop.line}, {stop.error}")
+        if finding.state != "error":
+            return finding
+        if not needed:
+            texts = [f"{name} stands in a text cell, which does not run: make it a code cell" for name in self._in_texts(finding)]
+            for text in texts:
+                self._flag(f"text_cell: {text}")
+            return replace(finding, message="; ".join([finding.message, *texts]))
+        for at in needed:
+            if newer := self._stopped[at].newer:
+                self._flag(f"{NEWER}: cell {self._cells[at][0]} needs {newer}, graded with {PYTHON}")
+        causes = [self._cause(at) for at in needed[:MOST_CAUSES]]
+        return replace(finding, message="; ".join([finding.message.removesuffix("."), *causes]))
+
+    def _in_texts(self, finding: Finding) -> list[str]:
+        """The names that the message misses and that a cell of text defines."""
+        missing = {name for found in NAMED.findall(finding.message) for name in found if name}
+        return [name for name in sorted(missing) if any(_last_definition(name, [(0, text)]) == 0 for text in self._texts)]
+
+    def _cause(self, position: int) -> str:
+        number, stop = self._cells[position][0], self._stopped[position]
+        if not stop.newer:
+            return stop.said(number)
+        told = re.match(r"3\.(\d+)", self._saved_by)
+        newer = told is not None and int(told[1]) >= int(stop.newer.rpartition(".")[2])
+        saved = f"Python {self._saved_by} saved the notebook" if newer else f"newer than {PYTHON}"
+        return (
+            f"code cell {number} is written for Python {stop.newer} ({saved}), and this is graded with Python {PYTHON}: "
+            f"a person will look at it ({stop.error})"
+        )
+
     def _timed_out(self, exercise: FrozenExercise) -> Finding:
         message = f"No answer within {self._timeout:g} s."
         for position, trouble in self._troubles.items():
             message += f" Code cell {self._cells[position][0]} {ENDINGS[trouble][1]}."
         return _failed(exercise, "timeout", message)
+
+
+def with_live(notebook: Any, release: Released) -> tuple[list[tuple[int, str]], frozenset[int]]:
+    """The cells to run, those that the release marks live among them, and the positions of these, which are never run as a whole."""
+    own = runnable(notebook, release)
+    numbers = {number for number, _ in own}
+    code = enumerate((cell for cell in notebook.cells if cell.cell_type == "code"), start=1)
+    live = [
+        (number, cell.source)
+        for number, cell in code
+        if number not in numbers and not is_check(cell) and cell.metadata.get(repair.AS_RUN, "") is not None
+    ]
+    cells = sorted([*own, *live], key=lambda cell: cell[0])
+    return cells, frozenset(position for position, (number, _) in enumerate(cells) if number not in numbers)
 
 
 def _failed(exercise: FrozenExercise, state: str, message: str) -> Finding:
@@ -422,7 +495,7 @@ def _failed(exercise: FrozenExercise, state: str, message: str) -> Finding:
 def _last_definition(name: str, cells: Sequence[tuple[int, str]]) -> int:
     """The position of the last cell that defines `name`, as text (a hostile cell is not worth parsing); -1 if none does."""
     # [ \t], for \s would run on over empty lines, from every one of them: a cell of nothing else would take for ever
-    defines = rf"(?:async\s+)?def\s+{name}\s*\(|class\s+{name}\b|{name}\s*(?::[^=\n]*)?=[^=]"
+    defines = rf"(?:async\s+)?def\s+{name}\s*[(\[]|class\s+{name}\b|{name}\s*(?::[^=\n]*)?=[^=]"
     defines += rf"|(?:from[ \t]+\S+[ \t]+)?import[ \t][^\n]*\b{name}\b"
     pattern = re.compile(rf"^[ \t]*(?:>>>[ \t]*|In \[\d+\]: )?(?:{defines})", re.MULTILINE)
     return max((position for position, (_, source) in enumerate(cells) if pattern.search(source)), default=-1)
@@ -440,6 +513,14 @@ def _number(told: dict[str, Any]) -> int:
     if not isinstance(number, int):
         raise ValueError("the answer names no cell")
     return number
+
+
+def _stop(data: Any) -> Stop:
+    seen = _mapping(data)
+    line, error, newer = seen.get("line"), seen.get("error"), seen.get("newer")
+    if not (isinstance(line, int) and isinstance(error, str) and isinstance(newer, str) and re.fullmatch(r"(3\.\d\d)?", newer)):
+        raise ValueError("the answer has something else where a cell's failure belongs")
+    return Stop(line, error, tuple(map(str, _list(seen.get("sets")))), newer)
 
 
 def _mapping(data: Any) -> dict[str, Any]:

@@ -5,7 +5,7 @@
         answer = sandbox.receive(timeout=60)
 
 Inside, `script` runs as `/course/<name>` with `sys.argv[1]` the number of a stream socket to the judge; a frame is its length
-(8 bytes, big-endian) and that many bytes. It sees the interpreter (/python), the packages of `bubblewrap.LEARNER_PACKAGES`
+(8 bytes, big-endian) and that many bytes. It sees the interpreter (/python), the packages of `course_lib.checks.packages`
 with what they need (/site), `modules` (/course, read-only), `files` in its working directory (/work, a small tmpfs), the
 system's libraries, and nothing else of the host: no network, no other process, no environment. Standard streams are /dev/null,
 for what a learner prints in a CI log could be a workflow command. `sys.path` is the standard library, /course, /site, /work:

@@ -25,6 +25,7 @@ from autograder.authoring import chapter as chapters_
 from autograder.authoring.chapter import ANSWER_LINE, Chapter
 from autograder.authoring.contract import STUB, Sources
 from autograder.authoring.contract import sources as real_sources
+from course_lib.checks import packages
 
 LEARNERS_NEED = {  # the oldest versions that will do: a learner's Jupyter, or Colab, brings its own
     "torch": "2.6",
@@ -204,7 +205,7 @@ def _hash(content: bytes) -> str:
 
 def _readme(chosen: list[Chapter]) -> str:
     rows = "\n".join(f"- `{_name(c)}`: {c.title} ({c.minutes} minutes). {c.summary}" for c in chosen)
-    return _README.format(rows=rows, example=_name(chosen[0]) if chosen else "ch44/ch44.ipynb")
+    return _README.format(rows=rows, packages=packages.listed(), example=_name(chosen[0]) if chosen else "ch44/ch44.ipynb")
 
 
 _README = """\
@@ -232,7 +233,8 @@ In Google Colab: upload `course.zip`, open the notebook, and run this in a first
 
 Each exercise is a function that raises `NotImplementedError`. Replace that line, run the cell, and run the check below it: it
 says what is wrong. You may add cells, imports and functions anywhere. The cells with the checks are locked; the grader uses its
-own anyway, on inputs that you have not seen.
+own anyway, on inputs that you have not seen. Where it runs there are Python's standard library, {packages}; no GPU, no network, and
+nobody to answer `input()`. Another package that you import is not there, and what uses it fails.
 
 To check a whole notebook at a shell: `python -m course_lib.check {example}`. Hand in the notebook under the name that it has.
 """

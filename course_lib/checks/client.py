@@ -10,6 +10,7 @@ import difflib
 import functools
 import html
 import os
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,6 +18,8 @@ from pathlib import Path
 from course_lib.checks.cases import FACET_TEXT, FrozenExercise, load
 from course_lib.checks.cells import notes
 from course_lib.checks.diagnosis import Finding, examine
+from course_lib.checks.names import roughly_set_by
+from course_lib.checks.notebook import NAMED
 
 FROZEN = Path(__file__).parents[1] / "frozen"
 
@@ -98,9 +101,27 @@ def _check_function(name: str, function: Callable) -> CheckResult:
     exercise = visible_cases(name)
     start = time.perf_counter()
     finding = examine(exercise, function)
+    if finding.state == "error":
+        finding.message = "; ".join([finding.message, *_cells_to_run(finding.message)])
     took = 1000 * (time.perf_counter() - start)
     praise = f"{len(exercise.cases)} visible cases, {took:.0f} ms. The grader draws more like them."
     return CheckResult(finding, praise, [facet for facet in FACET_TEXT if exercise.criteria.get(facet)])
+
+
+def _cells_to_run(message: str) -> list[str]:
+    """In Jupyter, the cells that were run and have not set a name that an answer misses."""
+    module = sys.modules.get("IPython.core.getipython")
+    shell = module.get_ipython() if module else None
+    if shell is None or getattr(shell, "kernel", None) is None:  # not Jupyter, but our own, which knows what stopped
+        return []
+    history = shell.user_ns["In"]
+    missing = [name for found in NAMED.findall(message) for name in found if name and name not in shell.user_ns]
+    cells = {name: [number for number, source in enumerate(history) if name in roughly_set_by(source)] for name in missing}
+    return [
+        f"In[{numbers[-1]}] was to set {name}: run it again, and look where it stops"
+        for name, numbers in cells.items()
+        if numbers
+    ]
 
 
 def is_judged_by_file(name: str) -> bool:

@@ -16,6 +16,9 @@ from course_lib.checks import views
 from course_lib.checks.cases import FACET_TEXT, FrozenCase, FrozenExercise, Observation
 from course_lib.checks.observing import observe
 
+NO_DEVICE = ("AssertionError", "RuntimeError", "AcceleratorError", "NotImplementedError", "ValueError")
+"""How PyTorch refuses a device that is not there."""
+
 SINGLE_RTOL, SINGLE_ATOL = 1e-4, 1e-5
 """How far a float32 result may stray."""
 
@@ -225,8 +228,26 @@ def _descriptions(
             "errors": _describe_error,
         }
         raised = f"It raises {seen.error}: {seen.message[:300]}" if seen.error and facet != "errors" else ""
-        lines.append(f"Case “{case.name}”: {raised or describe[facet](exercise, case, seen)}")
+        lines.append(f"Case “{case.name}”: {raised or describe[facet](exercise, case, seen)}{_remedy(exercise, seen)}")
     return lines
+
+
+def _remedy(exercise: FrozenExercise, seen: Observation) -> str:
+    """What to do about an exception that says where the code ran before rather than what is wrong with it."""
+    if any(word in seen.message for word in ("CUDA", "NVIDIA", "MPS", "mps")) and seen.error in NO_DEVICE:
+        return (
+            ". There is no GPU where this is graded: leave tensors on the device that they come on, as in "
+            "torch.zeros_like(x) or y.to(x.device), or ask torch.cuda.is_available() first."
+        )
+    if seen.error == "TypeError" and f"{exercise.name}()" in seen.message:
+        given = [list(case.call["arguments"]) for case in exercise.cases]
+        always = [name for name in given[0] if all(name in names for names in given)]
+        at_times = list(dict.fromkeys(name for names in given for name in names if name not in always))
+        also = f", and also with {' and '.join(at_times)}" if at_times else ""
+        return (
+            f". It is called as {exercise.name}({', '.join(always)}){also}: leave its parameters and their defaults as they were."
+        )
+    return ""
 
 
 def _describe_values(exercise: FrozenExercise, case: FrozenCase, seen: Observation) -> str:

@@ -1,7 +1,8 @@
 """Cells as IPython reads them: magics, `!commands`, `help?`, prompts and indents that were pasted, `await` outside a function.
 
 IPython's own transformer says what such a cell means; `Shell` is what the result calls as `get_ipython()`, and does no harm. Plain
-Python is compiled as it stands. A line keeps its number, and `from __future__` holds for the cells below, as in IPython.
+Python is compiled as it stands. A line keeps its number, and `from __future__` holds for the cells below, as in IPython. Unlike there,
+a statement that fails does not keep those below it from running (an import that is missing would cost a whole cell); each runs once.
 
 What the magics do here:
 
@@ -12,7 +13,8 @@ What the magics do here:
 - `%run` runs a file or a notebook, `%%writefile` writes one below the working directory;
 - a cell magic runs the body if it is Python (`%%time`, `%%capture`, `%%prun`, those of extensions), and not if it is another
   language's (`%%bash`, `%%html`) or another process's (`%%python`);
-- magics that a cell registers itself are called.
+- magics that a cell registers itself are called, and a line that is a magic without its `%` (`pip install x`) is one;
+- `%cd` goes to folders below the notebook's own, and `%env` sets what it says.
 """
 
 from __future__ import annotations
@@ -30,9 +32,12 @@ import shlex
 import sys
 import time
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
+
+from course_lib.checks import names
+from course_lib.checks.syntax import with_plain_spaces
 
 NAME = "__shell__"  # of the shell, in the namespace that it runs cells in
 FUTURES = functools.reduce(int.__or__, (getattr(__future__, name).compiler_flag for name in __future__.all_feature_names))
@@ -45,6 +50,78 @@ ELSEWHERE = frozenset(
 )
 """Cell magics whose body is no Python, or none that runs in this process."""
 
+AUTOMAGICS = frozenset(
+    (
+        *(
+            "pip",
+            "conda",
+            "mamba",
+            "micromamba",
+            "uv",
+            "cd",
+            "ls",
+            "ll",
+            "la",
+            "lk",
+            "ldir",
+            "lx",
+            "dir",
+            "mkdir",
+            "rmdir",
+            "rm",
+            "cp",
+            "mv",
+        ),
+        *("cat", "more", "less", "man", "pwd", "pushd", "popd", "dirs", "env", "set_env", "matplotlib", "pylab", "load_ext"),
+        *(
+            "reload_ext",
+            "unload_ext",
+            "autoreload",
+            "config",
+            "precision",
+            "who",
+            "whos",
+            "who_ls",
+            "time",
+            "timeit",
+            "run",
+            "prun",
+        ),
+        *(
+            "reset",
+            "reset_selective",
+            "history",
+            "hist",
+            "store",
+            "debug",
+            "pdb",
+            "pinfo",
+            "psearch",
+            "pprint",
+            "xmode",
+            "colors",
+        ),
+        *(
+            "automagic",
+            "alias",
+            "logstart",
+            "logstop",
+            "logon",
+            "logoff",
+            "save",
+            "recall",
+            "rerun",
+            "system",
+            "sx",
+            "sc",
+            "magic",
+        ),
+        *("lsmagic", "quickref", "clear", "gui", "page", "pycat", "tb", "notebook", "connect_info", "qtconsole"),
+    )
+)
+"""Magics and aliases that IPython takes without their `%`, in a cell of one line."""
+
+AUTOMAGIC = re.compile(r"\s*([a-z_]+)((?:\s+(?![=+*/<>&|^@%,.(\[-]).*|\s+--?\w.*)?)\s*")
 LEADING_BLANK_LINES = re.compile(r"(?:[^\S\n]*\n)*")
 TIMEIT_OPTION = re.compile(r"\s*-(?:[nrp]\s*\d+|v\s*(?P<name>\w+)|(?P<flags>[tcqo]+))(?=\s|$)")
 OTHER_OPTION = re.compile(r"\s*-(?:[lsTD]\s*\S+|[rq]|-[\w-]+)(?=\s|$)")  # of %time and %prun
@@ -84,10 +161,14 @@ class Shell:
         self.user_ns = self.user_global_ns = namespace
         self.config: dict[str, Any] = {}
         self.kernel = None
+        self.colors = "linux"  # which a debugger asks for
         self._magics: dict[tuple[str, str], Callable] = {}
         self._futures = 0
         self._only_definitions = False
+        self._wanted: Collection[str] | None = None  # the names whose definitions run; None for all
         self._loop: Any = None
+        self._home = Path.cwd()
+        self._history: list[Any] = [""] * 3
 
     def __getattr__(self, name: str) -> Nothing:
         if name.startswith("_"):
@@ -96,36 +177,109 @@ class Shell:
 
     # ---------------------------------------------------------------------------- cells
 
-    def run(self, source: str, filename: str, above: int = 0) -> None:
-        """Run a cell, or the body of one whose magic takes the first `above` lines. Whatever it raises comes through."""
-        source = "\n" * above + source
-        code = _compiled(source, filename, self._futures)
-        if code is None:
-            source = translated(source)
-            code = compile(source, filename, "exec", self._futures | ast.PyCF_ALLOW_TOP_LEVEL_AWAIT, dont_inherit=True)
-        linecache.cache[filename] = (len(source), None, source.splitlines(keepends=True), filename)  # for inspect.getsource
-        self._futures |= code.co_flags & FUTURES
-        if self._only_definitions:
-            self._run_definitions(ast.parse(source), filename)
-        else:
-            self._evaluate(code, self.user_ns, self.user_ns)
+    def cell(self, source: str, filename: str) -> None:
+        """Run a cell. Of what fails in it, the first comes through when all of it has run."""
+        number = _appended(self.user_ns.setdefault("In", [""]), source)
+        if (value := self.run(source, filename)) is not None:
+            self._remember(number, value)
 
-    def run_definitions(self, source: str, filename: str) -> None:
-        """Of a cell that can't be run as a whole, run what defines something and calls nothing."""
-        self._only_definitions = True
+    def _remember(self, number: int, value: Any) -> None:
+        """What a cell ends with is `_`, `_3` and `Out[3]`, unless the notebook has a `_` of its own."""
+        if self.user_ns.get("_", "") is self._history[0]:
+            self._history = [value, *self._history[:2]]
+            self.user_ns.update(zip(("_", "__", "___"), self._history, strict=True))
+        self.user_ns[f"_{number}"] = value
+        if isinstance(outputs := self.user_ns.setdefault("Out", {}), dict):
+            outputs[number] = value
+
+    def run(self, source: str, filename: str, above: int = 0) -> Any:
+        """Run a cell, or the body of one whose magic takes the first `above` lines. Returns what its last expression gives.
+
+        Raises: what the first statement raises that fails, when all the others have run.
+        """
+        source, tree = self._read("\n" * above + self._without_automagic(source), filename)
+        linecache.cache[filename] = (len(source), None, source.splitlines(keepends=True), filename)  # for inspect.getsource
+        if self._only_definitions:
+            return self._run_definitions(tree, filename)
+        value, failure, awaits = None, None, _needs_a_loop(tree.body)
+        for statement in _apart(tree.body):
+            if isinstance(failure, SystemExit) and not _defines(statement):
+                continue  # the cell was to end there: what stands below is not carried out, but is defined
+            try:
+                value = self._carry_out(statement, filename, awaits)
+            except (Exception, SystemExit) as error:
+                value, failure = None, failure or error
+        if failure is not None:
+            raise failure
+        return value
+
+    def _read(self, source: str, filename: str) -> tuple[str, ast.Module]:
+        """The Python that is meant, and its statements. Raises: SyntaxError, of the cell as IPython reads it."""
+        flags = self._futures | ast.PyCF_ALLOW_TOP_LEVEL_AWAIT | ast.PyCF_ONLY_AST
+
+        def parsed(text: str) -> ast.Module | None:
+            try:
+                return compile(text, filename, "exec", flags, dont_inherit=True)
+            except SyntaxError:
+                return None
+
+        if tree := parsed(source):
+            return source, tree
+        python = translated(source)
+        if tree := parsed(python):
+            return python, tree
+        if (plain := with_plain_spaces(source)) != source:
+            for text in (plain, translated(plain)):
+                if tree := parsed(text):
+                    return text, tree
+        compile(python, filename, "exec", flags, dont_inherit=True)
+        raise AssertionError("it compiles now")
+
+    def _without_automagic(self, source: str) -> str:
+        found = AUTOMAGIC.fullmatch(source) if "\n" not in source.strip() else None
+        if not found or found[1] not in AUTOMAGICS or found[1] in self.user_ns:
+            return source
+        return f"%{source.strip()}"
+
+    def _carry_out(self, statement: ast.stmt, filename: str, in_loop: bool = False) -> Any:
+        """Run one statement, in the event loop if it is to; of an expression, the value."""
+        flags = self._futures | ast.PyCF_ALLOW_TOP_LEVEL_AWAIT
+        if isinstance(statement, ast.Expr):
+            code = compile(ast.Expression(statement.value), filename, "eval", flags, dont_inherit=True)
+        else:
+            code = compile(ast.Module([statement], []), filename, "exec", flags, dont_inherit=True)
+        self._futures |= code.co_flags & FUTURES
+        if in_loop and not code.co_flags & inspect.CO_COROUTINE:
+            return self._awaited(_as_coroutine(code, self.user_ns))
+        return self._evaluate(code, self.user_ns, self.user_ns)
+
+    def run_definitions(self, source: str, filename: str, wanted: Collection[str] | None = None) -> None:
+        """Of a cell that can't be run as a whole, run what defines something (one of the names `wanted`) and calls nothing."""
+        self._only_definitions, self._wanted = True, wanted
         try:
             self.run(source, filename)
         finally:
             self._only_definitions = False
 
     def _run_definitions(self, tree: ast.Module, filename: str) -> None:
-        for statement in tree.body:
-            if _is_call_of_cell_magic(statement) or _defines(statement):
+        for statement in _apart(tree.body):
+            wanted = self._wanted is None or names.set_by([statement]) & set(self._wanted)
+            if _is_call_of_cell_magic(statement) or (wanted and _defines(statement)):
                 try:
-                    code = compile(ast.Module([statement], []), filename, "exec", self._futures, dont_inherit=True)
-                    exec(code, self.user_ns)
+                    self._carry_out(statement, filename)
                 except Exception:  # it needs what was left out
                     continue
+
+    def statements(self, source: str) -> list[ast.stmt]:
+        """What a cell consists of, with the body of a cell magic; nothing, if it can't be read."""
+        try:
+            found = self._read(source, "")[1].body
+        except Exception:
+            return []
+        for call in [one.value for one in found if isinstance(one, ast.Expr) and _is_call_of_cell_magic(one)]:
+            magic, _, body = (ast.literal_eval(argument) for argument in call.args)  # type: ignore[attr-defined]
+            found = [*found, *(self.statements(body) if magic not in ELSEWHERE else ())]
+        return found
 
     def _evaluate(self, code: types.CodeType, globals_: dict[str, Any], locals_: Any) -> Any:
         value = eval(code, globals_, locals_)
@@ -177,7 +331,7 @@ class Shell:
         if name == "capture":
             return self._captured(line, lambda: self.run(cell, filename, above))
         if name in ("time", "prun") or _is_python(cell):
-            self.run(cell, filename, above)
+            return self.run(cell, filename, above)
         return None
 
     def register_magic_function(self, function: Callable, magic_kind: str = "line", magic_name: str | None = None) -> None:
@@ -214,6 +368,10 @@ class Shell:
             return self.getoutput(line)
         if name == "pwd":
             return os.getcwd()
+        if name == "cd":
+            return self._go_to(self._expanded(line, caller))
+        if name in ("env", "set_env"):
+            return _environment(self._expanded(line, caller))
         if name == "pylab":
             from IPython.core.pylabtools import import_pylab
 
@@ -292,6 +450,13 @@ class Shell:
             sys.argv = arguments
             self.user_ns.update({name: value for name, value in names.items() if not name.startswith("__")})
 
+    def _go_to(self, line: str) -> None:
+        """`%cd FOLDER`, below the notebook's own; to others, which are not here, the cell stays where it is."""
+        words = [word for word in shlex.split(line) if word not in ("-q", "--")]
+        path = (Path.cwd() / (words[0] if words else self._home)).resolve()
+        if path.is_dir() and path.is_relative_to(self._home.resolve()):
+            os.chdir(path)
+
     def _expanded(self, text: str, caller: types.FrameType) -> str:
         """The line of a magic with `{expressions}` and `$names` put in."""
         from IPython.utils.text import DollarFormatter
@@ -314,9 +479,32 @@ def install(namespace: dict[str, Any]) -> None:
     """Give the namespace a shell, as `get_ipython()` there and in IPython, unless a real one runs; IPython is not imported for it."""
     shell = shell_of(namespace)
     namespace["get_ipython"] = lambda: shell
+    namespace |= {"_": "", "__": "", "___": "", "In": [""], "Out": {}, "exit": _stay, "quit": _stay, "input": _nobody_answers}
+    namespace |= {"_ih": namespace["In"], "_oh": namespace["Out"], "_dh": [os.getcwd()]}
     module = sys.modules.setdefault("IPython.core.getipython", types.ModuleType("IPython.core.getipython"))
     if not hasattr(module, "get_ipython") or module.get_ipython() is None:
         module.__dict__["get_ipython"] = _current
+
+
+def _stay(*_arguments: Any) -> None:
+    """`exit` and `quit` in a cell end a kernel, which there is none of."""
+
+
+def _nobody_answers(*_arguments: Any) -> str:
+    raise EOFError(
+        "input() waits for somebody to type, and nobody does when a notebook is checked or graded: write the value in the cell"
+    )
+
+
+def without_debuggers() -> None:
+    """From now on in this process, `breakpoint()` and `set_trace()` do nothing: nobody is there to debug."""
+    import bdb
+
+    def nothing(*_arguments: Any, **_options: Any) -> None:
+        return None
+
+    sys.breakpointhook = nothing
+    bdb.Bdb.set_trace = nothing  # type: ignore[assignment,method-assign]
 
 
 def _current() -> Any:
@@ -347,11 +535,40 @@ def _transformer() -> Any:
     return LineByLine()
 
 
-def _compiled(source: str, filename: str, flags: int) -> types.CodeType | None:
-    try:
-        return compile(source, filename, "exec", flags, dont_inherit=True)
-    except SyntaxError:
-        return None
+LOOP = frozenset(("create_task", "ensure_future", "get_running_loop", "TaskGroup"))
+"""What asks for a running event loop, as a kernel has one."""
+
+
+def _needs_a_loop(statements: list[ast.stmt]) -> bool:
+    """Whether a cell awaits something, or begins what is awaited later."""
+    return any(
+        isinstance(node, ast.Await | ast.AsyncFor | ast.AsyncWith) or getattr(node, "attr", getattr(node, "id", "")) in LOOP
+        for node in names.at_this_level(statements)
+    )
+
+
+async def _as_coroutine(code: types.CodeType, namespace: dict[str, Any]) -> Any:
+    return eval(code, namespace)
+
+
+def _apart(statements: list[ast.stmt]) -> Iterator[ast.stmt]:
+    """The statements, an import of several names made one for each: they succeed or fail by themselves."""
+    for statement in statements:
+        if isinstance(statement, ast.Import) and len(statement.names) > 1:
+            yield from (ast.copy_location(ast.Import([alias]), statement) for alias in statement.names)
+        elif isinstance(statement, ast.ImportFrom) and len(statement.names) > 1:
+            module, level = statement.module, statement.level
+            yield from (ast.copy_location(ast.ImportFrom(module, [alias], level), statement) for alias in statement.names)
+        else:
+            yield statement
+
+
+def _appended(history: Any, source: str) -> int:
+    """The number of a cell, which goes to the end of `In`; a learner may have made that anything."""
+    if not isinstance(history, list):
+        return 0
+    history.append(source)
+    return len(history) - 1
 
 
 def _is_python(source: str) -> bool:
@@ -392,9 +609,20 @@ def _without_options(line: str) -> str:
     return line
 
 
+def _environment(line: str) -> Any:
+    """`%env`, `%env NAME`, `%env NAME=VALUE` and `%env NAME VALUE`."""
+    name, sign, value = line.strip().partition("=" if "=" in line else " ")
+    if not name:
+        return dict(os.environ)
+    if not sign:
+        return os.environ.get(name)
+    os.environ[name.strip()] = value.strip()
+    return None
+
+
 def _existing(name: str) -> Path:
     path = Path(name).expanduser()
-    return path if path.exists() else Path(f"{path}.py")
+    return path if path.exists() or path.suffix in (".py", ".ipynb", ".ipy") else Path(f"{path}.py")
 
 
 def _sources(path: Path) -> list[str]:

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from course_lib.checks.cases import Observation
+from course_lib.checks.notebook import text_of
 
 MAX_ENTRIES = 10_000
 """Of an iterator that never ends, so many entries are taken."""
@@ -168,11 +169,3 @@ def _same(new: torch.Tensor, old: torch.Tensor) -> bool:
     if new.dtype != old.dtype or new.shape != old.shape:
         return False
     return torch.equal(new, old) or torch.equal(new.nan_to_num(), old.nan_to_num())
-
-
-def text_of(error: BaseException) -> str:
-    """What the exception says, or nothing if it refuses to say it."""
-    try:
-        return str(error)[:500]
-    except BaseException:
-        return ""

@@ -32,7 +32,7 @@ from autograder.authoring import freeze
 from autograder.paths import ROOT
 from autograder.publishing import release
 from autograder.publishing.book import BOOK, HOW_TO
-from course_lib.checks import client
+from course_lib.checks import client, packages
 
 BLOCK = re.compile(
     r"^(?P<fence>`{3,})(?P<kind>console|pycon|\{code-block\}[^\n]*)\n(?P<body>.*?)^(?P=fence)$|^% solve (?P<solve>[^\n]*)$",
@@ -164,6 +164,11 @@ def test_the_contributors_page(reader):
         else:
             shutil.copy(ROOT / name, page.folder)
     page.run()
+
+
+@pytest.mark.parametrize("name", ["learners", "teachers"])
+def test_the_packages_that_are_there_when_graded_are_listed(name):
+    assert packages.listed() in (BOOK / "how-to" / f"{name}.md").read_text(encoding="utf-8")
 
 
 def test_there_is_a_test_for_every_page():

@@ -48,6 +48,12 @@ def run(*sources, timeout=0.3):
         {},
         [],
         {"loaded": []},
+        {"loaded": {"1": "an error"}},
+        {"loaded": {"1": {"line": "3", "error": "E", "newer": "", "sets": []}}},
+        {"loaded": {"1": {"line": 3, "error": "E", "newer": "the newest", "sets": []}}},
+        {"loaded": {"1": {"line": 3, "error": "E", "newer": "", "sets": "a"}}},
+        {"loaded": {"2": {"line": 3, "error": "E", "newer": "", "sets": []}}},
+        {"loaded": {"x": {"line": 3, "error": "E", "newer": "", "sets": []}}},
     ],
     ids=repr,
 )

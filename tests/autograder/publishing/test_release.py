@@ -14,6 +14,7 @@ from packaging.version import Version
 from autograder.authoring.chapter import load, page_files
 from autograder.authoring.contract import references, sources
 from autograder.publishing import release
+from course_lib.checks import packages
 
 
 def _release(tiny, out, only=None, **options):
@@ -50,6 +51,7 @@ def test_a_bundle_has_notebooks_library_frozen_checks_and_a_readme(bundle):
     frozen = {name for name in files if "/frozen/" in name}
     assert frozen == {f"course_lib/course_lib/frozen/{name}" for name in ("double.npz", "quadruple.npz", "ch99.cells")}
     assert b"`ch99/ch99.ipynb`: A tiny chapter: twice (90 minutes)" in files["README.md"]
+    assert packages.listed().encode() in files["README.md"]
     assert b"attachment:ch99-007-1.png" in files["ch99/ch99.ipynb"]
 
 

@@ -1,8 +1,10 @@
 """The learner's check: what it says, how fast, and how it fails on bad input."""
 
 import json
+import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -133,12 +135,15 @@ def notebook(tmp_path, *sources):
     return path
 
 
-def command(path, frozen):
+def command(path, frozen, **environment):
     code = (
         "import sys, pathlib\nfrom course_lib.checks import client\nfrom course_lib.checks.command import main\n"
         f"client.FROZEN = pathlib.Path({str(frozen)!r})\nsys.exit(main(sys.argv[1:]))"
     )
-    return subprocess.run([sys.executable, "-c", code, *path], capture_output=True, text=True)
+    environment = {**os.environ, **environment}
+    return subprocess.run(
+        [sys.executable, "-c", code, *path], capture_output=True, text=True, env=environment, encoding="utf-8", errors="replace"
+    )
 
 
 def test_the_command_passes_fails_and_refuses(tmp_path, frozen):
@@ -154,3 +159,50 @@ def test_the_command_passes_fails_and_refuses(tmp_path, frozen):
     assert command([str(tmp_path / "none.ipynb")], frozen).returncode == 2
     assert command([str(notebook(tmp_path, "a = 1"))], frozen).returncode == 2
     assert command([], frozen).returncode == 2
+
+
+def test_the_command_names_what_stopped_and_what_will_be_missing(tmp_path, frozen):
+    right = (
+        "import seaborn as sns\nfrom course_lib import validate\ndef lambda_returns(advantages, values):\n    sns\n"
+        "    return (advantages + values + trained + np.zeros(1).item() + shift()).detach()\nimport sys\nsys.exit()"
+    )
+    live = "import numpy as np\ntrained = sum([0.0])\ndef shift():\n    return 0.0"
+    path = notebook(tmp_path, right, live, "check(lambda_returns)")
+    document = json.loads(path.read_text())
+    document["cells"][1]["metadata"] = {"tags": ["live"]}
+    path.write_text(json.dumps(document))
+    told = command([str(path)], frozen)
+    stopped = "code cell 1 stopped at line 1: ModuleNotFoundError: No module named 'seaborn'"
+    assert told.returncode == 1 and f"! {stopped}" in told.stdout
+    assert f"NameError: name 'sns' is not defined; {stopped}\n" in told.stdout
+    assert "! lambda_returns uses trained, which is not there when it is graded: only code cell 2 sets it" in told.stdout
+    assert "shift" not in told.stdout and "uses np" not in told.stdout
+    path.write_text(json.dumps(document).replace(" as sns", "").replace("sns", "np"))
+    assert "name 'trained' is not defined" in command([str(path)], frozen).stdout
+
+
+@pytest.mark.parametrize(("encoding", "passed"), [("ascii", "ok Passed"), ("cp1252", "ok Passed"), ("utf-8", "✓ Passed")])
+def test_the_command_prints_in_any_encoding(tmp_path, frozen, encoding, passed):
+    right = (
+        "from course_lib import validate\ndef lambda_returns(advantages, values):\n"
+        "    validate.same_shape(advantages=advantages, values=values)\n    return (advantages + values).detach()"
+    )
+    path = notebook(tmp_path, right, "check(lambda_returns)", "raise ValueError('λ…\\udc80')")
+    told = command([str(path)], frozen, PYTHONIOENCODING=encoding, PYTHONUTF8="0", LC_ALL="C")
+    assert told.returncode == 0 and passed in told.stdout and "1 of 1 pass" in told.stdout and not told.stderr
+
+
+@pytest.mark.parametrize(
+    ("message", "told"),
+    [
+        ("It raises NameError: name 'sns' is not defined", ["In[2] was to set sns: run it again, and look where it stops"]),
+        ("It raises NameError: name 'other' is not defined", []),
+        ("It raises NameError: name 'torch' is not defined", []),
+    ],
+)
+def test_in_jupyter_the_cell_that_was_to_set_a_missing_name_is_named(monkeypatch, message, told):
+    shell = SimpleNamespace(
+        kernel=1, user_ns={"In": ["", "sns = 1", "import nothing\nimport seaborn as sns\nimport torch"], "torch": 1}
+    )
+    monkeypatch.setitem(sys.modules, "IPython.core.getipython", SimpleNamespace(get_ipython=lambda: shell))
+    assert client._cells_to_run(message) == told

@@ -47,7 +47,9 @@ def after(*cells):
         (["a = get_ipython().system('ls')"], None),
         # line magics
         (["a = %pip install x"], None),
-        (["a = %env HOME"], None),
+        (["%env FIELD=1\na = %env FIELD"], "1"),
+        (["%set_env FIELD 2\nimport os\na = os.environ['FIELD']"], "2"),
+        (["a = %env NO_SUCH_VARIABLE"], None),
         (["import os\nhere = os.getcwd()\n%cd ..\na = os.getcwd() == here"], True),
         (["%load_ext autoreload\n%autoreload 2\n%unknown x y\n%config InlineBackend.figure_format = 'svg'\na = 1"], 1),
         (["%time a = 3"], 3),
