@@ -1,0 +1,529 @@
+"""A tensor: numbers in a row, a shape, and strides that say how far apart neighbours along each axis lie. Views share the row."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any, Iterator, Sequence
+
+from . import dtypes
+from .autograd import Node, backward, is_recording, start
+
+_NAMES: dict[str, frozenset[str]] = {}  # what the real torch has, for those who ask for something that is not here
+
+
+class Missing(AttributeError):
+    """Something of torch that the page does not have, though the notebook does."""
+
+
+def missing(owner: str, name: str) -> AttributeError:
+    """The error for `owner.name`."""
+    known = _NAMES.get(owner)
+    if known is not None and name not in known or name.startswith("__"):
+        return AttributeError(
+            f"'Tensor' object has no attribute '{name}'" if owner == "Tensor" else f"module '{owner}' has no attribute '{name}'"
+        )
+    return Missing(f"{owner}.{name} is not in the page's torch; it is in the notebook")
+
+
+class Size(tuple):
+    """A shape."""
+
+    def numel(self) -> int:
+        return count(self)
+
+    def __repr__(self) -> str:
+        return f"torch.Size([{', '.join(map(str, self))}])"
+
+    def __getitem__(self, index: Any) -> Any:
+        found = super().__getitem__(index)
+        return Size(found) if isinstance(index, slice) else found
+
+    def __add__(self, other: Any) -> Size:
+        return Size(tuple(self) + tuple(other))
+
+
+class Storage:
+    """The row of numbers that a tensor and its views share; `version` counts the changes in place."""
+
+    def __init__(self, numbers: list[Any]) -> None:
+        self.numbers = numbers
+        self.version = 0
+
+
+def count(shape: Sequence[int]) -> int:
+    total = 1
+    for size in shape:
+        total *= size
+    return total
+
+
+def strides_of(shape: Sequence[int]) -> tuple[int, ...]:
+    """Strides of numbers that lie in a row, the last axis closest together."""
+    strides, step = [], 1
+    for size in reversed(shape):
+        strides.append(step)
+        step *= max(size, 1)
+    return tuple(reversed(strides))
+
+
+def positions(shape: Sequence[int], strides: Sequence[int], offset: int) -> Sequence[int]:
+    """Where the entries lie in the row, in reading order."""
+    found = [offset]
+    for size, stride in zip(shape, strides):
+        found = [base + stride * i for base in found for i in range(size)]
+    return found
+
+
+def axis_of(axis: int, dims: int) -> int:
+    """The axis from the front. Raises IndexError if there is none."""
+    bound = max(dims, 1)
+    if not isinstance(axis, int) or isinstance(axis, bool):
+        raise TypeError(f"dim must be an int, not {type(axis).__name__}")
+    if not -bound <= axis < bound:
+        raise IndexError(f"Dimension out of range (expected to be in range of [{-bound}, {bound - 1}], but got {axis})")
+    return axis % bound
+
+
+class Tensor:
+    """See the module. `step` is what made it (autograd.Node), `base` the tensor that it is a view of."""
+
+    __slots__ = ("storage", "offset", "shape", "strides", "dtype", "_requires_grad", "grad", "step", "base", "_base_step", "__weakref__")
+
+    def __init__(self, storage: Storage, shape: Sequence[int], kind: dtypes.dtype, strides: Sequence[int] | None = None, offset: int = 0):
+        self.storage, self.offset, self.dtype = storage, offset, kind
+        self.shape = Size(shape)
+        self.strides = tuple(strides_of(shape) if strides is None else strides)
+        self._requires_grad = False
+        self.grad: Tensor | None = None
+        self.step: Node | None = None
+        self.base: Tensor | None = None
+        self._base_step: Node | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        raise missing("Tensor", name)
+
+    # ---- looking
+
+    @property
+    def ndim(self) -> int:
+        return len(self.shape)
+
+    dim = lambda self: len(self.shape)  # noqa: E731
+    numel = lambda self: count(self.shape)  # noqa: E731
+    nelement = numel
+
+    def size(self, dim: int | None = None) -> Any:
+        return self.shape if dim is None else self.shape[axis_of(dim, self.ndim)]
+
+    def stride(self, dim: int | None = None) -> Any:
+        return self.strides if dim is None else self.strides[axis_of(dim, self.ndim)]
+
+    @property
+    def is_leaf(self) -> bool:
+        return self.grad_fn is None
+
+    @property
+    def grad_fn(self) -> Node | None:
+        return self.step if self.step is not None and self.step.name != "AccumulateGrad" else None
+
+    @property
+    def device(self) -> str:
+        return "cpu"
+
+    @property
+    def is_cuda(self) -> bool:
+        return False
+
+    @property
+    def data(self) -> Tensor:
+        return self.detach()
+
+    def is_floating_point(self) -> bool:
+        return self.dtype.is_floating_point
+
+    def is_contiguous(self) -> bool:
+        return all(size == 1 or stride == want for size, stride, want in zip(self.shape, self.strides, strides_of(self.shape)))
+
+    def flat(self) -> list[Any]:
+        """The entries in reading order."""
+        if self.is_contiguous():
+            return self.storage.numbers[self.offset : self.offset + count(self.shape)]
+        return list(map(self.storage.numbers.__getitem__, positions(self.shape, self.strides, self.offset)))
+
+    def item(self) -> Any:
+        if count(self.shape) != 1:
+            raise RuntimeError(f"a Tensor with {count(self.shape)} elements cannot be converted to Scalar")
+        return self.flat()[0]
+
+    def tolist(self) -> Any:
+        nested: list[Any] = self.flat()
+        for size in reversed(self.shape[1:]):
+            nested = [nested[i : i + size] for i in range(0, len(nested), size)] if size else [[] for _ in range(count(self.shape[:-1]))]
+        return nested if self.shape else nested[0]
+
+    def _single(self) -> Any:
+        if count(self.shape) != 1:
+            raise ValueError("only one element tensors can be converted to Python scalars")
+        return self.flat()[0]
+
+    def __float__(self) -> float:
+        return float(self._single())
+
+    def __int__(self) -> int:
+        return int(self._single())
+
+    def __index__(self) -> int:
+        if self.dtype.category == 2 or count(self.shape) != 1:
+            raise TypeError("only integer tensors of a single element can be converted to an index")
+        return int(self.flat()[0])
+
+    def __bool__(self) -> bool:
+        if count(self.shape) > 1:
+            raise RuntimeError("Boolean value of Tensor with more than one value is ambiguous")
+        if count(self.shape) == 0:
+            raise RuntimeError("Boolean value of Tensor with no values is ambiguous")
+        return bool(self.flat()[0])
+
+    def __len__(self) -> int:
+        if not self.shape:
+            raise TypeError("len() of a 0-d tensor")
+        return self.shape[0]
+
+    def __iter__(self) -> Iterator[Tensor]:
+        if not self.shape:
+            raise TypeError("iteration over a 0-d tensor")
+        return iter([self[i] for i in range(self.shape[0])])
+
+    def __contains__(self, value: Any) -> bool:
+        return bool((self == value).any())
+
+    __hash__ = object.__hash__
+
+    def __format__(self, spec: str) -> str:
+        return format(self.item(), spec) if not self.shape else format(repr(self), spec)
+
+    def __repr__(self) -> str:
+        body = _shown(self.tolist(), self.dtype, len("tensor("))
+        kind = "" if self.dtype in (dtypes.float32, dtypes.int64, dtypes.bool_) else f", dtype={self.dtype}"
+        grad = f", grad_fn=<{self.grad_fn.name}>" if self.grad_fn else ", requires_grad=True" if self.requires_grad else ""
+        return f"tensor({body}{kind}{grad})"
+
+    def numpy(self) -> Any:
+        raise Missing("Tensor.numpy is not in the page's torch; it is in the notebook")
+
+    # ---- gradients
+
+    @property
+    def requires_grad(self) -> bool:
+        self.follow_base()
+        return self._requires_grad
+
+    @requires_grad.setter
+    def requires_grad(self, value: bool) -> None:
+        self._requires_grad = value
+
+    def requires_grad_(self, requires_grad: bool = True) -> Tensor:
+        if requires_grad and not self.dtype.is_floating_point:
+            raise RuntimeError("only Tensors of floating point dtype can require gradients")
+        self.requires_grad = requires_grad
+        return self
+
+    def detach(self) -> Tensor:
+        """The same numbers, without a graph."""
+        return Tensor(self.storage, self.shape, self.dtype, self.strides, self.offset)
+
+    def backward(self, gradient: Tensor | None = None, retain_graph: bool | None = None) -> None:
+        for step, arrived in backward([self], [start(self, gradient)]).items():
+            if step.name == "AccumulateGrad":
+                leaf = step.tensor  # type: ignore[attr-defined]
+                leaf.grad = arrived.clone() if leaf.grad is None else leaf.grad + arrived
+
+    def follow_base(self) -> None:
+        """A view of something that was changed in place since is, by now, a view of what that has become."""
+        if self.base is not None:
+            self.base.follow_base()
+            if self.base.step is not self._base_step:
+                self._made_as_view(self.base)
+
+    def _made_as_view(self, base: Tensor) -> None:
+        """Record where this view lies in its base: the gradient goes back to those places."""
+        self.base, self._base_step = base, base.step
+        if base.requires_grad and is_recording():
+            places, size = self._places_in(base), count(base.shape)
+
+            def send_back(gradient: Tensor) -> tuple[Tensor]:
+                numbers = [0.0] * size
+                for place, value in zip(places, gradient.flat()):
+                    numbers[place] += value
+                return (Tensor(Storage(numbers), base.shape, base.dtype),)
+
+            self.requires_grad, self.step = True, Node("ViewBackward0", (base,), send_back)
+            self._base_step = base.step
+
+    def _places_in(self, base: Tensor) -> Sequence[int]:
+        """The positions of the entries among the base's, in reading order."""
+        mine = positions(self.shape, self.strides, self.offset)
+        if base.is_contiguous():
+            return [place - base.offset for place in mine]
+        order = {place: number for number, place in enumerate(positions(base.shape, base.strides, base.offset))}
+        return [order[place] for place in mine]
+
+    def as_view(self, shape: Sequence[int], strides: Sequence[int], offset: int) -> Tensor:
+        """A tensor of other shape on the same numbers."""
+        view = Tensor(self.storage, shape, self.dtype, strides, offset)
+        view._made_as_view(self)
+        return view
+
+    # ---- taking parts and writing to them
+
+    def __getitem__(self, index: Any) -> Tensor:
+        view, rest = self._basic(index)
+        return view if rest is None else view._taken(rest)
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        view, rest = self._basic(index)
+        if rest is None:
+            view.write(value)
+            return
+        places, shape = view._picked(rest)
+        value = _tensor_of(value, self.dtype)
+        numbers = spread(value, shape)
+        view._write_places(places, shape, value, numbers)
+
+    def _basic(self, index: Any) -> tuple[Tensor, list[Any] | None]:
+        """The view that the integers, slices and None of an index give; and, for each of its axes, the tensor that picks there or None."""
+        entries = list(index) if isinstance(index, tuple) else [index]
+        entries = [_as_index(entry) for entry in entries]
+        used = sum(entry.ndim if _is_mask(entry) else 1 for entry in entries if entry is not None and entry is not Ellipsis)
+        if used > self.ndim:
+            raise IndexError(f"too many indices for tensor of dimension {self.ndim}")
+        at = next((i for i, entry in enumerate(entries) if entry is Ellipsis), len(entries))
+        full = [slice(None)] * (self.ndim - used)
+        entries = entries[:at] + full + [entry for entry in entries[at + 1 :]]
+        shape, strides, offset, axis = [], [], self.offset, 0
+        picks: list[Any] = []
+        for entry in entries:
+            if entry is None:
+                shape.append(1), strides.append(0), picks.append(None)
+                continue
+            size, stride = self.shape[axis], self.strides[axis]
+            if isinstance(entry, slice):
+                first, last, by = entry.indices(size)
+                if by < 1:
+                    raise ValueError("step must be greater than zero")
+                shape.append(len(range(first, last, by))), strides.append(stride * by), picks.append(None)
+                offset += first * stride if shape[-1] else 0
+            elif isinstance(entry, int):
+                if not -size <= entry < size:
+                    raise IndexError(f"index {entry} is out of bounds for dimension {axis} with size {size}")
+                offset += (entry % size) * stride
+            else:
+                width = entry.ndim if _is_mask(entry) else 1
+                if _is_mask(entry) and entry.shape != self.shape[axis : axis + width]:
+                    differs = next(i for i in range(width) if entry.shape[i] != self.shape[axis + i])
+                    raise IndexError(
+                        f"The shape of the mask {list(entry.shape)} at index {differs} does not match the shape of the indexed tensor"
+                        f" {list(self.shape)} at index {axis + differs}"
+                    )
+                shape += self.shape[axis : axis + width]
+                strides += self.strides[axis : axis + width]
+                picks += _as_integers(entry) if _is_mask(entry) else [entry]
+                axis += width - 1
+            axis += 1
+        view = self.as_view(shape, strides, offset)
+        return view, picks if any(pick is not None for pick in picks) else None
+
+    def _picked(self, picks: list[Any]) -> tuple[list[int], tuple[int, ...]]:
+        """Where the entries lie that tensors of integers pick, and the shape that they have together."""
+        axes = [axis for axis, pick in enumerate(picks) if pick is not None]
+        together = broadcast_shapes(*(picks[axis].shape for axis in axes))
+        chosen = []
+        for axis in axes:
+            size = self.shape[axis]
+            for entry in picks[axis].flat():
+                if not -size <= entry < size:
+                    raise IndexError(f"index {entry} is out of bounds for dimension {axis} with size {size}")
+            chosen.append([entry % size for entry in spread(picks[axis], together)])
+        first = axes[0] if axes == list(range(axes[0], axes[-1] + 1)) else 0
+        others = [axis for axis in range(self.ndim) if axis not in axes]
+        before = [axis for axis in others if axis < first]
+        after = [axis for axis in others if axis >= first]
+        jumps = [sum(i * self.strides[axis] for i, axis in zip(tuple_, axes)) for tuple_ in zip(*chosen)]
+        lead = positions([self.shape[axis] for axis in before], [self.strides[axis] for axis in before], self.offset)
+        tail = positions([self.shape[axis] for axis in after], [self.strides[axis] for axis in after], 0)
+        places = [a + b + c for a in lead for b in jumps for c in tail]
+        return places, (*(self.shape[axis] for axis in before), *together, *(self.shape[axis] for axis in after))
+
+    def _taken(self, picks: list[Any]) -> Tensor:
+        places, shape = self._picked(picks)
+        result = Tensor(Storage([self.storage.numbers[place] for place in places]), shape, self.dtype)
+        if self.requires_grad and is_recording():
+            order = {place: number for number, place in enumerate(positions(self.shape, self.strides, self.offset))}
+
+            def send_back(gradient: Tensor) -> tuple[Tensor]:
+                numbers = [0.0] * count(self.shape)
+                for place, value in zip(places, gradient.flat()):
+                    numbers[order[place]] += value
+                return (Tensor(Storage(numbers), self.shape, self.dtype),)
+
+            result.requires_grad, result.step = True, Node("IndexBackward0", (self,), send_back)
+        return result
+
+    def write(self, value: Any) -> Tensor:
+        """Put these numbers in place of the tensor's own, with their graph."""
+        value = _tensor_of(value, self.dtype)
+        self._write_places(positions(self.shape, self.strides, self.offset), self.shape, value, spread(value, self.shape))
+        return self
+
+    def _write_places(self, places: Sequence[int], shape: Sequence[int], value: Tensor, numbers: list[Any]) -> None:
+        """Write to `places` of the row. Whatever the tensor is a view of has a new step from now on, and so have its other views."""
+        owner = self
+        while owner.base is not None:
+            owner = owner.base
+        if is_recording() and owner.requires_grad and owner.grad_fn is None:
+            raise RuntimeError(
+                "a leaf Variable that requires grad is being used in an in-place operation."
+                if owner is self
+                else "a view of a leaf Variable that requires grad is being used in an in-place operation."
+            )
+        for place, number in zip(places, self.dtype.numbers(numbers)):
+            self.storage.numbers[place] = number
+        self.storage.version += 1
+        if not is_recording() or not (owner.requires_grad or value.requires_grad):
+            return
+        order = {place: number for number, place in enumerate(positions(owner.shape, owner.strides, owner.offset))}
+        written = [order[place] for place in places]
+
+        def send_back(gradient: Tensor) -> tuple[Tensor, Tensor]:
+            kept = gradient.flat()
+            to_value = Tensor(Storage([kept[place] for place in written]), shape, gradient.dtype)
+            for place in written:
+                kept[place] = 0.0
+            return Tensor(Storage(kept), gradient.shape, gradient.dtype), sum_to(to_value, value.shape)
+
+        owner.step = Node("CopySlices", (owner, value), send_back)
+        owner.requires_grad = True
+        if owner is not self:
+            self.requires_grad = True
+            self.follow_base()
+
+
+# -------------------------------------------------------------------------------------------------------- shapes that meet
+
+
+def broadcast_shapes(*shapes: Sequence[int]) -> tuple[int, ...]:
+    """The shape that all have together. Raises RuntimeError if there is none."""
+    result: list[int] = []
+    for shape in shapes:
+        padded = [1] * (len(result) - len(shape)) + list(shape)
+        result = [1] * (len(padded) - len(result)) + result
+        for axis in reversed(range(len(result))):
+            a, b = result[axis], padded[axis]
+            if a != b and a != 1 and b != 1:
+                raise RuntimeError(f"The size of tensor a ({a}) must match the size of tensor b ({b}) at non-singleton dimension {axis}")
+            result[axis] = b if a == 1 else a
+    return tuple(result)
+
+
+def spread_strides(tensor: Tensor, shape: Sequence[int]) -> tuple[int, ...]:
+    """Strides with which a tensor has this larger shape: 0 along the axes that it lacks."""
+    lacking = len(shape) - tensor.ndim
+    own = [0 if size == 1 and want != 1 else stride for size, stride, want in zip(tensor.shape, tensor.strides, shape[lacking:])]
+    return (*[0] * lacking, *own)
+
+
+def spread(tensor: Tensor, shape: Sequence[int]) -> list[Any]:
+    """The entries of a tensor as they fill a larger shape. Raises RuntimeError if they do not fit."""
+    if tuple(tensor.shape) == tuple(shape):
+        return tensor.flat()
+    sizes, strides = list(tensor.shape), list(tensor.strides)
+    while len(sizes) > len(shape) and sizes[0] == 1:  # a single row, written to a vector
+        sizes, strides = sizes[1:], strides[1:]
+    lead = len(shape) - len(sizes)
+    for axis, size in enumerate(sizes):
+        want = shape[lead + axis] if lead + axis >= 0 else 0
+        if size not in (1, want):
+            raise RuntimeError(
+                f"The expanded size of the tensor ({want}) must match the existing size ({size}) at non-singleton dimension"
+                f" {max(lead + axis, 0)}.  Target sizes: {list(shape)}.  Tensor sizes: {list(tensor.shape)}"
+            )
+    whole = Tensor(tensor.storage, sizes, tensor.dtype, strides, tensor.offset)
+    return list(map(whole.storage.numbers.__getitem__, positions(shape, spread_strides(whole, shape), whole.offset)))
+
+
+def sum_to(tensor: Tensor, shape: Sequence[int]) -> Tensor:
+    """Undo broadcasting: add up along the axes that were spread."""
+    if tuple(tensor.shape) == tuple(shape):
+        return tensor
+    numbers = [0.0] * count(shape)
+    lead = tensor.ndim - len(shape)
+    steps = [0] * lead + [0 if size == 1 else stride for size, stride in zip(shape, strides_of(shape))]
+    for place, value in zip(positions(tensor.shape, steps, 0), tensor.flat()):
+        numbers[place] += value
+    return Tensor(Storage(numbers), shape, tensor.dtype)
+
+
+# ------------------------------------------------------------------------------------------------------------------- small
+
+
+def _is_mask(entry: Any) -> bool:
+    return isinstance(entry, Tensor) and entry.dtype is dtypes.bool_
+
+
+def _as_index(entry: Any) -> Any:
+    if isinstance(entry, bool):
+        raise Missing("an index of True or False is not in the page's torch; it is in the notebook")
+    if entry is None or entry is Ellipsis or isinstance(entry, (int, slice)):
+        if isinstance(entry, slice):
+            return slice(*(None if part is None else part.__index__() for part in (entry.start, entry.stop, entry.step)))
+        return entry
+    if isinstance(entry, (list, range)):
+        entry = from_nested(list(entry))
+    if isinstance(entry, Tensor):
+        if entry.dtype.category == 2:
+            raise IndexError("tensors used as indices must be long, int, byte or bool tensors")
+        return int(entry.item()) if not entry.shape and entry.dtype is not dtypes.bool_ else entry
+    raise IndexError(
+        "only integers, slices (`:`), ellipsis (`...`), None and long or byte Variables are valid indices"
+        f" (got {type(entry).__name__})"
+    )
+
+
+def _as_integers(mask: Tensor) -> list[Tensor]:
+    """The places where a mask is True, as one tensor of integers for each of its axes."""
+    found = [index for index, kept in zip(itertools.product(*map(range, mask.shape)), mask.flat()) if kept]
+    return [Tensor(Storage([index[axis] for index in found]), (len(found),), dtypes.int64) for axis in range(mask.ndim)]
+
+
+def from_nested(value: Any, kind: dtypes.dtype | None = None) -> Tensor:
+    """A tensor of nested lists, or of a number."""
+    if isinstance(value, Tensor):
+        return Tensor(Storage((kind or value.dtype).numbers(value.flat())), value.shape, kind or value.dtype)
+    shape: list[int] = []
+    level = [value]
+    while level and isinstance(level[0], (list, tuple, range)) or (level and isinstance(level[0], Tensor) and level[0].shape):
+        sizes = [len(entry) if hasattr(entry, "__len__") else -1 for entry in level]
+        if len(set(sizes)) > 1:
+            raise ValueError(f"expected sequence of length {sizes[0]} at dim {len(shape)} (got {next(s for s in sizes if s != sizes[0])})")
+        shape.append(sizes[0])
+        level = [part for entry in level for part in entry]
+    kinds = [entry.dtype if isinstance(entry, Tensor) else dtypes.of_number(entry) for entry in level]
+    numbers = [entry.item() if isinstance(entry, Tensor) else entry for entry in level]
+    for number in numbers:
+        if not isinstance(number, (int, float)):
+            raise TypeError(f"new(): invalid data type '{type(number).__name__}'")
+    kind = kind or max(kinds, key=lambda one: one.rank, default=dtypes.float32)
+    return Tensor(Storage(kind.numbers(numbers)), shape, kind)
+
+
+def _tensor_of(value: Any, kind: dtypes.dtype) -> Tensor:
+    return value if isinstance(value, Tensor) else from_nested(value, kind)
+
+
+def _shown(value: Any, kind: dtypes.dtype, indent: int) -> str:
+    if not isinstance(value, list):
+        return f"{value:.4f}" if kind.is_floating_point and value == value and abs(value) != float("inf") else str(value)
+    if not value or not isinstance(value[0], list):
+        return f"[{', '.join(_shown(entry, kind, 0) for entry in value)}]"
+    inner = (",\n" + " " * (indent + 1)).join(_shown(entry, kind, indent + 1) for entry in value)
+    return f"[{inner}]"
