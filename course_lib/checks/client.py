@@ -14,8 +14,9 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from course_lib.checks.cases import FACET_TEXT, FrozenExercise, load
+from course_lib.checks.cases import FACET_TEXT, FrozenExercise
 from course_lib.checks.diagnosis import Finding, examine
+from course_lib.checks.stored import load
 
 FROZEN = Path(__file__).parents[1] / "frozen"
 
