@@ -11,7 +11,7 @@ from typing import Any
 from . import autograd, functional, ops, tensor as _tensor
 from .autograd import enable_grad, inference_mode, is_recording as is_grad_enabled, no_grad
 from .dtypes import BY_NAME as _KINDS
-from .dtypes import dtype, result_type
+from .dtypes import bfloat16, dtype, float16, result_type
 from .tensor import Missing, Size, Tensor, broadcast_shapes, missing
 
 bool = _KINDS["bool"]  # noqa: A001
@@ -24,8 +24,8 @@ inf, nan, pi, e = ops.inf, ops.nan, ops.math.pi, ops.math.e
 __version__ = "2.13.0+page"
 
 _FUNCTIONS = """
-add sub mul div floor_divide remainder pow minimum maximum logaddexp clamp where masked_fill nan_to_num lerp bitwise_and bitwise_or bitwise_xor
-bitwise_not isclose allclose equal sum mean nansum nanmean var std var_mean std_mean prod all any count_nonzero max min amax amin argmax argmin
+add sub mul div floor_divide remainder pow minimum maximum logaddexp clamp where addcmul addcdiv masked_fill nan_to_num lerp bitwise_and bitwise_or bitwise_xor
+bitwise_not isclose allclose equal sum mean nansum nanmean norm var std var_mean std_mean prod all any count_nonzero max min amax amin argmax argmin
 logsumexp median quantile log_softmax softmax cumsum cumprod argsort sort topk diff gather index_select masked_select nonzero argwhere flip roll cat
 stack tril triu reshape flatten unsqueeze squeeze permute transpose t movedim broadcast_to narrow select unbind split chunk diagonal matmul mm dot outer
 vdot clone repeat_interleave index_add scatter scatter_add take_along_dim
@@ -39,7 +39,7 @@ _ALIASES = {
 }  # fmt: skip
 _METHODS = """view expand contiguous repeat to""".split()
 _IN_PLACE = """
-add sub mul div pow clamp masked_fill exp log neg abs sqrt sigmoid tanh relu square reciprocal floor ceil round nan_to_num lerp index_add scatter
+add sub mul div pow clamp addcmul addcdiv masked_fill exp log neg abs sqrt sigmoid tanh relu square reciprocal floor ceil round nan_to_num lerp index_add scatter
 scatter_add cumsum logical_not
 """.split()
 

@@ -9,7 +9,7 @@ from typing import Any, Iterable
 class dtype:
     """float64, float32, int64, int32, uint8 or bool. `rank` orders them; two of one `category` differ in size only."""
 
-    def __init__(self, name: str, long_name: str, category: int, rank: int) -> None:
+    def __init__(self, name: str, long_name: str, category: int, rank: float) -> None:
         self.name, self.long_name, self.category, self.rank = name, long_name, category, rank
 
     def __repr__(self) -> str:
@@ -21,6 +21,8 @@ class dtype:
 
     def numbers(self, values: Iterable[Any]) -> list[Any]:
         """The values as numbers of this kind: what a float32 cannot hold is rounded, as it is there."""
+        if self.name in ("float16", "bfloat16"):
+            raise NotImplementedError(f"torch.{self.name} is not in the page's torch; it is in the notebook")
         if self.name == "float32":
             return array("f", list(map(_single, values))).tolist()
         if self.name == "float64":
@@ -49,6 +51,8 @@ int32 = dtype("int32", "Int", 1, 2)
 int64 = dtype("int64", "Long", 1, 3)
 float32 = dtype("float32", "Float", 2, 4)
 float64 = dtype("float64", "Double", 2, 5)
+float16 = dtype("float16", "Half", 2, 3.5)
+bfloat16 = dtype("bfloat16", "BFloat16", 2, 3.5)
 BY_NAME = {kind.name: kind for kind in (bool_, uint8, int32, int64, float32, float64)}
 
 

@@ -116,3 +116,10 @@ def normalize(input: Tensor, p: float = 2.0, dim: int = 1, eps: float = 1e-12) -
     if p != 2:
         raise Missing("normalize with p other than 2 is not in the page's torch; it is in the notebook")
     return input / (input**2).sum(dim, keepdim=True).sqrt().clamp(min=eps)
+
+
+def layer_norm(input: Tensor, normalized_shape: Sequence[int], weight: Any = None, bias: Any = None, eps: float = 1e-5) -> Tensor:
+    axes = tuple(range(input.ndim - len(normalized_shape), input.ndim))
+    result = (input - input.mean(axes, keepdim=True)) / (input.var(axes, unbiased=False, keepdim=True) + eps).sqrt()
+    result = result if weight is None else result * weight
+    return result if bias is None else result + bias

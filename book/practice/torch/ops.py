@@ -30,7 +30,8 @@ def record(result: Tensor, name: str, sources: Sequence[Tensor], send_back: Call
 
 
 def tensor_like(value: Any, kind: dtypes.dtype | None = None) -> Tensor:
-    return value if isinstance(value, Tensor) else from_nested(value, kind)
+    """The tensor, or one of a Python number, which is not rounded until it meets another."""
+    return value if isinstance(value, Tensor) else from_nested(value, kind or (dtypes.float64 if isinstance(value, float) else None))
 
 
 def need_tensor(function: str, argument: str, position: int, value: Any) -> None:
@@ -48,11 +49,13 @@ def entrywise(
     operands: Sequence[Any],
     kind: dtypes.dtype | None = None,
     keeps: str = "operands",
+    chooses: bool = False,
 ) -> Tensor:
     """`compute` of each entry of the operands, which are spread to one shape.
 
     `slopes` has for each operand the derivative of `compute` with regard to it, a function of the entries and of the result's. `keeps`
-    says which numbers it needs, and which must not be changed in place therefore: "operands", "others", "result" or "nothing".
+    says which numbers it needs, and which must not be changed in place therefore: "operands", "others", "result" or "nothing". If
+    `compute` only chooses among its operands, what is not chosen gets a gradient of 0, even of an infinite one.
     """
     tensors = [tensor_like(operand) for operand in operands]
     kind = kind or dtypes.result_type(*operands)
@@ -72,7 +75,8 @@ def entrywise(
             if not tensor.requires_grad:
                 back.append(None)
                 continue
-            parts = [g * slope(*entries) for g, *entries in zip(arriving, *columns, numbers)]
+            slopes_here = [slope(*entries) for entries in zip(*columns, numbers)]
+            parts = [g * s if s or not chooses else 0.0 for g, s in zip(arriving, slopes_here)]
             back.append(sum_to(make(parts, shape, tensor.dtype), tensor.shape))
         return back
 
@@ -195,7 +199,7 @@ _KEEPING: dict[str, tuple[Callable, Callable]] = {  # integers stay integers
     "floor": (lambda x: x if isinstance(x, int) or x != x or abs(x) == inf else math.floor(x), lambda x, y: 0.0),
     "ceil": (lambda x: x if isinstance(x, int) or x != x or abs(x) == inf else math.ceil(x), lambda x, y: 0.0),
     "round": (lambda x: x if isinstance(x, int) or x != x or abs(x) == inf else round(x), lambda x, y: 0.0),
-    "relu": (lambda x: x if x > 0 or x != x else x * 0, lambda x, y: float(x > 0)),
+    "relu": (lambda x: x if x > 0 or x != x else type(x)(0), lambda x, y: float(x > 0)),
 }
 _ASKING: dict[str, Callable] = {
     "isnan": lambda x: x != x,
@@ -220,7 +224,7 @@ def _unary(name: str) -> Callable:
                     " `logical_not()` operator instead."
                 )
             compute, slope = _KEEPING[name]
-            return entrywise(name, compute, [slope], [input], keeps="nothing" if name == "neg" else "operands")
+            return entrywise(name, compute, [slope], [input], keeps="nothing" if name == "neg" else "operands", chooses=name == "relu")
         return entrywise(name, _ASKING[name], None, [input], dtypes.bool_)
 
     function.__name__ = name
@@ -290,12 +294,12 @@ def pow_(input: Any, exponent: Any) -> Tensor:
 
 def minimum(input: Tensor, other: Tensor) -> Tensor:
     need_tensor("minimum", "input", 1, input), need_tensor("minimum", "other", 2, other)
-    return entrywise("minimum", _smaller, [lambda a, b, y: _share(a <= b, b <= a), lambda a, b, y: _share(b <= a, a <= b)], [input, other])
+    return entrywise("minimum", _smaller, [lambda a, b, y: _share(a <= b, b <= a), lambda a, b, y: _share(b <= a, a <= b)], [input, other], chooses=True)
 
 
 def maximum(input: Tensor, other: Tensor) -> Tensor:
     need_tensor("maximum", "input", 1, input), need_tensor("maximum", "other", 2, other)
-    return entrywise("maximum", _larger, [lambda a, b, y: _share(a >= b, b >= a), lambda a, b, y: _share(b >= a, a >= b)], [input, other])
+    return entrywise("maximum", _larger, [lambda a, b, y: _share(a >= b, b >= a), lambda a, b, y: _share(b >= a, a >= b)], [input, other], chooses=True)
 
 
 def logaddexp(input: Tensor, other: Tensor) -> Tensor:
@@ -313,7 +317,7 @@ def clamp(input: Tensor, min: Any = None, max: Any = None) -> Tensor:  # noqa: A
         lambda x, low, high, y: float(x < low < high),
         lambda x, low, high, y: float(high < x or high < low),
     ]
-    return entrywise("clamp", lambda x, low, high: x if x != x else _smaller(_larger(x, low), high), slopes, operands, kind)
+    return entrywise("clamp", lambda x, low, high: x if x != x else _smaller(_larger(x, low), high), slopes, operands, kind, chooses=True)
 
 
 def where(condition: Tensor, input: Any = None, other: Any = None) -> Any:
@@ -355,6 +359,14 @@ def nan_to_num(input: Tensor, nan: float = 0.0, posinf: float | None = None, neg
         [lambda x, y: float(x == x and abs(x) != inf)],
         [input],
     )
+
+
+def addcmul(input: Tensor, tensor1: Tensor, tensor2: Tensor, *, value: float = 1) -> Tensor:
+    return input + value * tensor1 * tensor2
+
+
+def addcdiv(input: Tensor, tensor1: Tensor, tensor2: Tensor, *, value: float = 1) -> Tensor:
+    return input + value * tensor1 / tensor2
 
 
 def lerp(input: Tensor, end: Tensor, weight: Any) -> Tensor:
@@ -560,6 +572,12 @@ def mean(input: Tensor, dim: Any = None, keepdim: bool = False, *, dtype: Any = 
     return _reduce(
         "Mean", x, dim, keepdim, lambda v: divide(_total(v), len(v)), x.dtype, lambda group, y: [1 / len(group)] * len(group)
     )
+
+
+def norm(input: Tensor, p: Any = 2, dim: Any = None, keepdim: bool = False) -> Tensor:
+    if p not in (2, "fro", None):
+        raise Missing("a norm other than the Euclidean one is not in the page's torch; it is in the notebook")
+    return _root_or_zero(sum_(input * input, dim, keepdim))
 
 
 def nansum(input: Tensor, dim: Any = None, keepdim: bool = False) -> Tensor:
