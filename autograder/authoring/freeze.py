@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from autograder.authoring import artefacts, complaints
@@ -139,4 +140,6 @@ def _plain(value: Any, dtype: torch.dtype) -> Any:
         return [_plain(entry, dtype) for entry in value]
     if isinstance(value, torch.Tensor):
         return (value.to(dtype) if value.is_floating_point() else value).detach().clone()
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(value.copy())
     return value

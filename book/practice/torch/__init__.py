@@ -19,7 +19,8 @@ float32 = float = _KINDS["float32"]  # noqa: A001
 float64 = double = _KINDS["float64"]
 int64 = long = _KINDS["int64"]
 int32 = int = _KINDS["int32"]  # noqa: A001
-uint8 = _KINDS["uint8"]
+int16 = short = _KINDS["int16"]
+int8, uint8 = _KINDS["int8"], _KINDS["uint8"]
 inf, nan, pi, e = ops.inf, ops.nan, ops.math.pi, ops.math.e
 __version__ = "2.13.0+page"
 

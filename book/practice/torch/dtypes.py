@@ -29,7 +29,7 @@ class dtype:
             return list(map(float, values))
         if self.name == "bool":
             return list(map(bool, values))
-        bits = {"int64": 64, "int32": 32, "uint8": 8}[self.name]
+        bits = {"int64": 64, "int32": 32, "int16": 16, "int8": 8, "uint8": 8}[self.name]
         return [_wrapped(int(value), bits, self.name != "uint8") for value in values]
 
 
@@ -47,13 +47,15 @@ def _wrapped(value: int, bits: int, signed: bool) -> int:
 
 bool_ = dtype("bool", "Bool", 0, 0)
 uint8 = dtype("uint8", "Byte", 1, 1)
+int8 = dtype("int8", "Char", 1, 1.2)
+int16 = dtype("int16", "Short", 1, 1.5)
 int32 = dtype("int32", "Int", 1, 2)
 int64 = dtype("int64", "Long", 1, 3)
 float32 = dtype("float32", "Float", 2, 4)
 float64 = dtype("float64", "Double", 2, 5)
 float16 = dtype("float16", "Half", 2, 3.5)
 bfloat16 = dtype("bfloat16", "BFloat16", 2, 3.5)
-BY_NAME = {kind.name: kind for kind in (bool_, uint8, int32, int64, float32, float64)}
+BY_NAME = {kind.name: kind for kind in (bool_, uint8, int8, int16, int32, int64, float32, float64)}
 
 
 def of_number(value: Any) -> dtype:

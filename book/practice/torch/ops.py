@@ -776,7 +776,8 @@ def _along(name: str, x: Tensor, axis: int, compute: Callable, send: Callable | 
         arriving = gradient.flat()
         return [arranged([send([arriving[p] for p in where_], group, row) for where_, group, row in zip(places, groups, rows)], x.dtype)]
 
-    return record(result, f"{name}Backward0", [x], send_back, [x])
+    keeps = {"Cumprod": [x], "Softmax": [result], "LogSoftmax": [result]}.get(name, [])
+    return record(result, f"{name}Backward0", [x], send_back, keeps)
 
 
 def _float_rows(name: str, x: Tensor, dtype: Any) -> Tensor:
