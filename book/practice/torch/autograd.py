@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from typing import Any, Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 _recording = [True]
 
@@ -19,24 +20,49 @@ class Node:
     needs: if one has been changed in place meanwhile, the gradient would be wrong, and is refused.
     """
 
-    def __init__(self, name: str, sources: Sequence[Any], send_back: Callable[[Any], Sequence[Any]], relies_on: Sequence[Any] = ()) -> None:
+    def __init__(
+        self, name: str, sources: Sequence[Any], send_back: Callable[[Any], Sequence[Any]], relies_on: Sequence[Any] = ()
+    ) -> None:
         self.name = name
         self.sources = [step_of(source) for source in sources]
         self.send_back = send_back
-        self._versions = [(tensor.storage, tensor.storage.version) for tensor in relies_on]
+        self.relies_on = [(tensor, tensor.storage.version) for tensor in relies_on]
+        self.is_used_up = False
 
-    def backward(self, gradient: Any) -> Sequence[Any]:
-        for storage, version in self._versions:
-            if storage.version != version:
-                raise RuntimeError(
-                    "one of the variables needed for gradient computation has been modified by an inplace operation: it is at version "
-                    f"{storage.version}; expected version {version} instead."
-                )
-        with no_grad():
-            return self.send_back(gradient)
+    def backward(self, gradient: Any, keep: bool) -> Sequence[Any]:
+        """The gradients of the sources. Unless they are to be kept, the numbers that the step relied on are gone afterwards."""
+        if self.is_used_up:
+            raise RuntimeError(USED_UP)
+        for tensor, version in self.relies_on:
+            if tensor.storage.version != version:
+                raise RuntimeError(_changed(tensor, version))
+        self.is_used_up = bool(self.relies_on) and not keep
+        return self.send_back(gradient)
+
+    def result_is_written_to(self, result: Any, target: Any) -> None:
+        """The result now lives in another tensor, over which it was written: that one must not change, then."""
+        self.relies_on = [(target if one is result else one, version) for one, version in self.relies_on]
+        self.relies_on = [(one, one.storage.version if one is target else version) for one, version in self.relies_on]
 
     def __repr__(self) -> str:
         return f"<{self.name} object>"
+
+
+USED_UP = (
+    "Trying to backward through the graph a second time (or directly access saved tensors after they have already been freed). Saved"
+    " intermediate values of the graph are freed when you call .backward() or autograd.grad(). Specify retain_graph=True if you need to"
+    " backward through the graph a second time or if you need to access saved tensors after calling backward."
+)
+
+
+def _changed(tensor: Any, version: int) -> str:
+    made_by = f", which is output 0 of {tensor.grad_fn.name.removesuffix('Backward0')}," if tensor.grad_fn else ""
+    return (
+        "one of the variables needed for gradient computation has been modified by an inplace operation:"
+        f" [torch.{tensor.dtype.long_name}Tensor {list(tensor.shape)}]{made_by} is at version {tensor.storage.version}; expected version"
+        f" {version} instead. Hint: enable anomaly detection to find the operation that failed to compute its gradient, with"
+        " torch.autograd.set_detect_anomaly(True, check_nan=False)."
+    )
 
 
 class Leaf(Node):
@@ -56,7 +82,93 @@ def step_of(tensor: Any) -> Node | None:
     return tensor.step
 
 
+def backward(roots: Sequence[Any], gradients: Sequence[Any], keep: bool = False) -> dict[Node, Any]:
+    """The gradient that arrives at each step on the way from `roots`, given those of the roots."""
+    arrived: dict[Node, Any] = {}
+
+    def add(step: Node | None, gradient: Any) -> None:
+        if step is not None and gradient is not None:
+            arrived[step] = arrived[step] + gradient if step in arrived else gradient
+
+    with no_grad():
+        for root, gradient in zip(roots, gradients, strict=True):
+            add(step_of(root), gradient)
+        for step in _latest_first([step_of(root) for root in roots]):
+            if step in arrived:
+                for source, gradient in zip(step.sources, step.backward(arrived[step], keep), strict=True):
+                    add(source, gradient)
+    return arrived
+
+
+def _latest_first(roots: Sequence[Node | None]) -> Iterator[Node]:
+    """All steps behind `roots`, each before those that it was made from."""
+    finished: list[Node] = []
+    seen: set[int] = set()
+    waiting: list[tuple[Node, bool]] = [(root, False) for root in roots if root is not None]
+    while waiting:
+        step, sources_done = waiting.pop()
+        if sources_done:
+            finished.append(step)
+        elif id(step) not in seen:
+            seen.add(id(step))
+            waiting.append((step, True))
+            waiting.extend((source, False) for source in step.sources if source is not None)
+    return reversed(finished)
+
+
+# ----------------------------------------------------------------------------------------------------- what learners call
+
+
+def accumulate(output: Any, gradient: Any = None, retain_graph: bool | None = None) -> None:
+    """`output.backward()`: add to the `grad` of every leaf behind the output."""
+    for step, arrived in backward([output], [start(output, gradient)], bool(retain_graph)).items():
+        if isinstance(step, Leaf):
+            step.tensor.grad = arrived.clone() if step.tensor.grad is None else step.tensor.grad + arrived
+
+
+def grad(
+    outputs: Any,
+    inputs: Any,
+    grad_outputs: Any = None,
+    retain_graph: bool | None = None,
+    *,
+    allow_unused: bool = False,
+) -> tuple[Any, ...]:
+    """The gradients of `outputs` with regard to `inputs`, as `torch.autograd.grad` gives them."""
+    outputs = list(outputs) if isinstance(outputs, (tuple, list)) else [outputs]
+    inputs = list(inputs) if isinstance(inputs, (tuple, list)) else [inputs]
+    weights = list(grad_outputs) if isinstance(grad_outputs, (tuple, list)) else [grad_outputs] * len(outputs)
+    seeds = [start(output, weight, number) for number, (output, weight) in enumerate(zip(outputs, weights, strict=True))]
+    if not all(tensor.requires_grad for tensor in inputs):
+        raise RuntimeError("One of the differentiated Tensors does not require grad")
+    arrived = backward(outputs, seeds, bool(retain_graph))
+    found = [arrived.get(step_of(tensor)) for tensor in inputs]  # type: ignore[arg-type]  # all of them have a step
+    if not allow_unused and any(gradient is None for gradient in found):
+        raise RuntimeError(
+            "One of the differentiated Tensors appears to not have been used in the graph. Set allow_unused=True if this is the"
+            " desired behavior."
+        )
+    return tuple(found)
+
+
+def start(output: Any, weight: Any, number: int = 0) -> Any:
+    """The gradient to begin with at an output: 1 for a single number."""
+    if not output.requires_grad:
+        raise RuntimeError(f"element {number} of tensors does not require grad and does not have a grad_fn")
+    if weight is not None:
+        if weight.shape != output.shape:
+            raise RuntimeError(
+                f"Mismatch in shape: grad_output[{number}] has a shape of {weight.shape} and output[{number}] has a shape of"
+                f" {output.shape}."
+            )
+        return weight.detach()
+    if output.numel() != 1:
+        raise RuntimeError("grad can be implicitly created only for scalar outputs")
+    return output.detach().new_ones(output.shape)
+
+
 def is_recording() -> bool:
+    """Whether steps are remembered: not within `no_grad`."""
     return _recording[-1]
 
 
@@ -85,83 +197,28 @@ class _Switch(contextlib.ContextDecorator):
 
 
 class no_grad(_Switch):
-    pass
+    """Nothing that is computed within remembers how."""
 
 
 class inference_mode(_Switch):
-    pass
+    """The same, here."""
 
 
 class enable_grad(_Switch):
+    """Within `no_grad`, an exception from it."""
+
     state = True
 
 
-def backward(roots: Sequence[Any], gradients: Sequence[Any]) -> dict[Node, Any]:
-    """The gradient that arrives at each step on the way from `roots`, given those of the roots."""
-    arrived: dict[Node, Any] = {}
+class set_grad_enabled(_Switch):
+    """One or the other, from now on or within a `with`."""
 
-    def add(step: Node | None, gradient: Any) -> None:
-        if step is not None and gradient is not None:
-            arrived[step] = arrived[step] + gradient if step in arrived else gradient
+    def __init__(self, mode: bool) -> None:
+        super().__init__()
+        self.state = mode
+        self._before = _recording[-1]
+        _recording[-1] = mode
 
-    with no_grad():
-        for root, gradient in zip(roots, gradients):
-            add(step_of(root), gradient)
-        for step in _latest_first([step_of(root) for root in roots]):
-            if step in arrived:
-                for source, gradient in zip(step.sources, step.backward(arrived[step])):
-                    add(source, gradient)
-    return arrived
-
-
-def _latest_first(roots: Sequence[Node | None]) -> Iterator[Node]:
-    """All steps behind `roots`, each before those that it was made from."""
-    finished: list[Node] = []
-    seen: set[int] = set()
-    waiting: list[tuple[Node, bool]] = [(root, False) for root in roots if root is not None]
-    while waiting:
-        step, sources_done = waiting.pop()
-        if sources_done:
-            finished.append(step)
-        elif id(step) not in seen:
-            seen.add(id(step))
-            waiting.append((step, True))
-            waiting.extend((source, False) for source in step.sources if source is not None)
-    return reversed(finished)
-
-
-def grad(outputs: Any, inputs: Any, grad_outputs: Any = None, retain_graph: bool | None = None, create_graph: bool = False,
-         allow_unused: bool = False) -> tuple[Any, ...]:
-    """The gradients of `outputs` with regard to `inputs`, as `torch.autograd.grad` gives them."""
-    if create_graph:
-        raise NotImplementedError("create_graph is not in the page's torch; it is in the notebook")
-    outputs = list(outputs) if isinstance(outputs, (tuple, list)) else [outputs]
-    inputs = list(inputs) if isinstance(inputs, (tuple, list)) else [inputs]
-    weights = list(grad_outputs) if isinstance(grad_outputs, (tuple, list)) else [grad_outputs] * len(outputs)
-    arrived = backward(outputs, [start(output, weight) for output, weight in zip(outputs, weights)])
-    found = []
-    for tensor in inputs:
-        if not tensor.requires_grad:
-            raise RuntimeError("One of the differentiated Tensors does not require grad")
-        gradient = arrived.get(step_of(tensor))
-        if gradient is None and not allow_unused:
-            raise RuntimeError(
-                "One of the differentiated Tensors appears to not have been used in the graph. Set allow_unused=True if this is the desired behavior."
-            )
-        found.append(gradient)
-    return tuple(found)
-
-
-def start(output: Any, weight: Any) -> Any:
-    """The gradient to begin with at an output: 1 for a single number."""
-    if not output.requires_grad:
-        raise RuntimeError("element 0 of tensors does not require grad and does not have a grad_fn")
-    if weight is not None:
-        if weight.shape != output.shape:
-            raise RuntimeError(
-                f"Mismatch in shape: grad_output[0] has a shape of {weight.shape} and output[0] has a shape of {output.shape}."
-            )
-        return weight.detach()
-    if output.numel() != 1:
-        raise RuntimeError("grad can be implicitly created only for scalar outputs")
-    return output.detach().new_ones(output.shape)
+    def __exit__(self, *exc: object) -> None:
+        _recording.pop()
+        _recording[-1] = self._before

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from array import array
-from typing import Any, Iterable
+from collections.abc import Iterable
+from typing import Any
+
+from .missing import Missing
 
 
 class dtype:
@@ -16,13 +19,20 @@ class dtype:
         return f"torch.{self.name}"
 
     @property
+    def c_name(self) -> str:
+        """As some of torch's errors call it."""
+        return {"Float": "float", "Double": "double", "Long": "long int", "Byte": "unsigned char", "Char": "signed char"}.get(
+            self.long_name, self.long_name.lower()
+        )
+
+    @property
     def is_floating_point(self) -> bool:
         return self.category == 2
 
     def numbers(self, values: Iterable[Any]) -> list[Any]:
         """The values as numbers of this kind: what a float32 cannot hold is rounded, as it is there."""
         if self.name in ("float16", "bfloat16"):
-            raise NotImplementedError(f"torch.{self.name} is not in the page's torch; it is in the notebook")
+            raise Missing(f"torch.{self.name}")
         if self.name == "float32":
             return array("f", list(map(_single, values))).tolist()
         if self.name == "float64":
@@ -30,12 +40,16 @@ class dtype:
         if self.name == "bool":
             return list(map(bool, values))
         bits = {"int64": 64, "int32": 32, "int16": 16, "int8": 8, "uint8": 8}[self.name]
-        return [_wrapped(int(value), bits, self.name != "uint8") for value in values]
+        return [_wrapped(_whole(value), bits, self.name != "uint8") for value in values]
 
 
 def _single(value: Any) -> float:
     value = float(value)
     return value if -3.4028235677973366e38 < value < 3.4028235677973366e38 or value != value else value * float("inf")
+
+
+def _whole(value: Any) -> int:
+    return int(value) if isinstance(value, int) or abs(value) < 2**63 else -(2**63)  # also of what is no number
 
 
 def _wrapped(value: int, bits: int, signed: bool) -> int:

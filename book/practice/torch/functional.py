@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any, Sequence
+import math
+from collections.abc import Sequence
+from typing import Any
 
-from . import dtypes, ops
-from .ops import _logsigmoid, _sigmoid, _softplus, entrywise, log_softmax, make, softmax  # noqa: F401
-from .tensor import Missing, Tensor, missing
+from . import dtypes
+from .entrywise import OF_ONE, entrywise, exponential, log_logistic, logistic, where
+from .making import full, make
+from .missing import Missing, missing
+from .moving import cat
+from .rows import log_softmax
+from .tensor import Tensor
 
-sigmoid, tanh, relu = ops.UNARY["sigmoid"], ops.UNARY["tanh"], ops.UNARY["relu"]
+sigmoid, tanh, relu = OF_ONE["sigmoid"], OF_ONE["tanh"], OF_ONE["relu"]
 
 
 def __getattr__(name: str) -> Any:
@@ -17,14 +23,18 @@ def __getattr__(name: str) -> Any:
 
 def logsigmoid(input: Tensor) -> Tensor:
     if not input.dtype.is_floating_point:
-        raise NotImplementedError(f'"log_sigmoid_cpu" not implemented for \'{input.dtype.long_name}\'')
-    return entrywise("logsigmoid", _logsigmoid, [lambda x, y: _sigmoid(-x)], [input])
+        raise NotImplementedError(f"\"log_sigmoid_cpu\" not implemented for '{input.dtype.long_name}'")
+    return entrywise("logsigmoid", log_logistic, [lambda x, y: logistic(-x)], [input])
+
+
+def _softplus(x: float) -> float:
+    return x if x > 20 else math.log1p(exponential(x))
 
 
 def softplus(input: Tensor, beta: float = 1.0, threshold: float = 20.0) -> Tensor:
     if beta != 1 or threshold != 20:
         return softplus(input * beta) / beta
-    return entrywise("softplus", _softplus, [lambda x, y: 1.0 if x > 20 else _sigmoid(x)], [input])
+    return entrywise("softplus", _softplus, [lambda x, y: 1.0 if x > 20 else logistic(x)], [input])
 
 
 def silu(input: Tensor) -> Tensor:
@@ -41,7 +51,7 @@ def one_hot(tensor: Tensor, num_classes: int = -1) -> Tensor:
 
 def pad(input: Tensor, pad: Sequence[int], mode: str = "constant", value: float = 0.0) -> Tensor:
     if mode != "constant":
-        raise Missing(f"pad with mode {mode!r} is not in the page's torch; it is in the notebook")
+        raise Missing(f"torch.nn.functional.pad with mode={mode!r}")
     result = input
     for number in range(len(pad) // 2):
         axis = input.ndim - 1 - number
@@ -51,8 +61,8 @@ def pad(input: Tensor, pad: Sequence[int], mode: str = "constant", value: float 
         for length, first in ((before, True), (after, False)):
             if length > 0:
                 shape = (*result.shape[:axis], length, *result.shape[axis + 1 :])
-                border = ops.full(shape, value, dtype=result.dtype)
-                result = ops.cat([border, result] if first else [result, border], axis)
+                border = full(shape, value, dtype=result.dtype)
+                result = cat([border, result] if first else [result, border], axis)
     return result
 
 
@@ -72,12 +82,12 @@ def l1_loss(input: Tensor, target: Tensor, reduction: str = "mean") -> Tensor:
 
 def smooth_l1_loss(input: Tensor, target: Tensor, reduction: str = "mean", beta: float = 1.0) -> Tensor:
     distance = (input - target).abs()
-    return _reduced(ops.where(distance < beta, 0.5 * distance**2 / beta, distance - 0.5 * beta), reduction)
+    return _reduced(where(distance < beta, 0.5 * distance**2 / beta, distance - 0.5 * beta), reduction)
 
 
 def huber_loss(input: Tensor, target: Tensor, reduction: str = "mean", delta: float = 1.0) -> Tensor:
     distance = (input - target).abs()
-    return _reduced(ops.where(distance <= delta, 0.5 * distance**2, delta * (distance - 0.5 * delta)), reduction)
+    return _reduced(where(distance <= delta, 0.5 * distance**2, delta * (distance - 0.5 * delta)), reduction)
 
 
 def binary_cross_entropy_with_logits(input: Tensor, target: Tensor, weight: Any = None, reduction: str = "mean") -> Tensor:
@@ -92,10 +102,16 @@ def binary_cross_entropy(input: Tensor, target: Tensor, weight: Any = None, redu
     return _reduced(losses if weight is None else losses * weight, reduction)
 
 
-def cross_entropy(input: Tensor, target: Tensor, weight: Any = None, ignore_index: int = -100, reduction: str = "mean",
-                  label_smoothing: float = 0.0) -> Tensor:
+def cross_entropy(
+    input: Tensor,
+    target: Tensor,
+    weight: Any = None,
+    ignore_index: int = -100,
+    reduction: str = "mean",
+    label_smoothing: float = 0.0,
+) -> Tensor:
     if weight is not None or label_smoothing:
-        raise Missing("cross_entropy with weights or smoothing is not in the page's torch; it is in the notebook")
+        raise Missing("torch.nn.functional.cross_entropy with weight= or label_smoothing=")
     axis = 0 if input.ndim == 1 else 1
     logps = log_softmax(input, axis)
     if target.dtype.is_floating_point:
@@ -107,14 +123,14 @@ def cross_entropy(input: Tensor, target: Tensor, weight: Any = None, ignore_inde
 def nll_loss(input: Tensor, target: Tensor, weight: Any = None, ignore_index: int = -100, reduction: str = "mean") -> Tensor:
     axis = 0 if input.ndim == 1 else 1
     kept = target != ignore_index
-    index = ops.where(kept, target, 0)
-    losses = ops.where(kept, -input.gather(axis, index.unsqueeze(axis)).squeeze(axis), 0.0)
+    index = where(kept, target, 0)
+    losses = where(kept, -input.gather(axis, index.unsqueeze(axis)).squeeze(axis), 0.0)
     return losses.sum() / kept.sum() if reduction == "mean" else _reduced(losses, reduction)
 
 
 def normalize(input: Tensor, p: float = 2.0, dim: int = 1, eps: float = 1e-12) -> Tensor:
     if p != 2:
-        raise Missing("normalize with p other than 2 is not in the page's torch; it is in the notebook")
+        raise Missing(f"torch.nn.functional.normalize with p={p}")
     return input / (input**2).sum(dim, keepdim=True).sqrt().clamp(min=eps)
 
 

@@ -3,43 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 from . import dtypes
-from .autograd import Node, backward, is_recording, start
-
-_NAMES: dict[str, frozenset[str]] = {}  # what the real torch has, for those who ask for something that is not here
-
-
-class Missing(AttributeError):
-    """Something of torch that the page does not have, though the notebook does."""
-
-
-def missing(owner: str, name: str) -> AttributeError:
-    """The error for `owner.name`."""
-    known = _NAMES.get(owner)
-    if known is not None and name not in known or name.startswith("__"):
-        return AttributeError(
-            f"'Tensor' object has no attribute '{name}'" if owner == "Tensor" else f"module '{owner}' has no attribute '{name}'"
-        )
-    return Missing(f"{owner}.{name} is not in the page's torch; it is in the notebook")
-
-
-class Size(tuple):
-    """A shape."""
-
-    def numel(self) -> int:
-        return count(self)
-
-    def __repr__(self) -> str:
-        return f"torch.Size([{', '.join(map(str, self))}])"
-
-    def __getitem__(self, index: Any) -> Any:
-        found = super().__getitem__(index)
-        return Size(found) if isinstance(index, slice) else found
-
-    def __add__(self, other: Any) -> Size:
-        return Size(tuple(self) + tuple(other))
+from .autograd import Leaf, Node, accumulate, is_recording
+from .missing import Missing, missing
+from .shapes import Size, axis_of, broadcast_shapes, count, positions, strides_of
 
 
 class Storage:
@@ -50,46 +20,26 @@ class Storage:
         self.version = 0
 
 
-def count(shape: Sequence[int]) -> int:
-    total = 1
-    for size in shape:
-        total *= size
-    return total
-
-
-def strides_of(shape: Sequence[int]) -> tuple[int, ...]:
-    """Strides of numbers that lie in a row, the last axis closest together."""
-    strides, step = [], 1
-    for size in reversed(shape):
-        strides.append(step)
-        step *= max(size, 1)
-    return tuple(reversed(strides))
-
-
-def positions(shape: Sequence[int], strides: Sequence[int], offset: int) -> Sequence[int]:
-    """Where the entries lie in the row, in reading order."""
-    found = [offset]
-    for size, stride in zip(shape, strides):
-        found = [base + stride * i for base in found for i in range(size)]
-    return found
-
-
-def axis_of(axis: int, dims: int) -> int:
-    """The axis from the front. Raises IndexError if there is none."""
-    bound = max(dims, 1)
-    if not isinstance(axis, int) or isinstance(axis, bool):
-        raise TypeError(f"dim must be an int, not {type(axis).__name__}")
-    if not -bound <= axis < bound:
-        raise IndexError(f"Dimension out of range (expected to be in range of [{-bound}, {bound - 1}], but got {axis})")
-    return axis % bound
-
-
 class Tensor:
     """See the module. `step` is what made it (autograd.Node), `base` the tensor that it is a view of."""
 
-    __slots__ = ("storage", "offset", "shape", "strides", "dtype", "_requires_grad", "grad", "step", "base", "_base_step", "__weakref__")
+    __slots__ = (
+        "__weakref__",
+        "_base_step",
+        "_requires_grad",
+        "base",
+        "dtype",
+        "grad",
+        "offset",
+        "shape",
+        "step",
+        "storage",
+        "strides",
+    )
 
-    def __init__(self, storage: Storage, shape: Sequence[int], kind: dtypes.dtype, strides: Sequence[int] | None = None, offset: int = 0):
+    def __init__(
+        self, storage: Storage, shape: Sequence[int], kind: dtypes.dtype, strides: Sequence[int] | None = None, offset: int = 0
+    ):
         self.storage, self.offset, self.dtype = storage, offset, kind
         self.shape = Size(shape)
         self.strides = tuple(strides_of(shape) if strides is None else strides)
@@ -124,7 +74,7 @@ class Tensor:
 
     @property
     def grad_fn(self) -> Node | None:
-        return self.step if self.step is not None and self.step.name != "AccumulateGrad" else None
+        return self.step if self.step is not None and not isinstance(self.step, Leaf) else None
 
     @property
     def device(self) -> str:
@@ -142,7 +92,7 @@ class Tensor:
         return self.dtype.is_floating_point
 
     def is_contiguous(self) -> bool:
-        return all(size == 1 or stride == want for size, stride, want in zip(self.shape, self.strides, strides_of(self.shape)))
+        return all(size == 1 or stride == want for size, stride, want in zip(self.shape, self.strides, strides_of(self.shape), strict=True))
 
     def flat(self) -> list[Any]:
         """The entries in reading order."""
@@ -158,7 +108,11 @@ class Tensor:
     def tolist(self) -> Any:
         nested: list[Any] = self.flat()
         for size in reversed(self.shape[1:]):
-            nested = [nested[i : i + size] for i in range(0, len(nested), size)] if size else [[] for _ in range(count(self.shape[:-1]))]
+            nested = (
+                [nested[i : i + size] for i in range(0, len(nested), size)]
+                if size
+                else [[] for _ in range(count(self.shape[:-1]))]
+            )
         return nested if self.shape else nested[0]
 
     def _single(self) -> Any:
@@ -209,7 +163,7 @@ class Tensor:
         return f"tensor({body}{kind}{grad})"
 
     def numpy(self) -> Any:
-        raise Missing("Tensor.numpy is not in the page's torch; it is in the notebook")
+        raise Missing("Tensor.numpy")
 
     # ---- gradients
 
@@ -233,10 +187,8 @@ class Tensor:
         return Tensor(self.storage, self.shape, self.dtype, self.strides, self.offset)
 
     def backward(self, gradient: Tensor | None = None, retain_graph: bool | None = None) -> None:
-        for step, arrived in backward([self], [start(self, gradient)]).items():
-            if step.name == "AccumulateGrad":
-                leaf = step.tensor  # type: ignore[attr-defined]
-                leaf.grad = arrived.clone() if leaf.grad is None else leaf.grad + arrived
+        """Add to the `grad` of every leaf behind this tensor."""
+        accumulate(self, gradient, retain_graph)
 
     def follow_base(self) -> None:
         """A view of something that was changed in place since is, by now, a view of what that has become."""
@@ -253,7 +205,7 @@ class Tensor:
 
             def send_back(gradient: Tensor) -> tuple[Tensor]:
                 numbers = [0.0] * size
-                for place, value in zip(places, gradient.flat()):
+                for place, value in zip(places, gradient.flat(), strict=True):
                     numbers[place] += value
                 return (Tensor(Storage(numbers), base.shape, base.dtype),)
 
@@ -348,7 +300,7 @@ class Tensor:
         others = [axis for axis in range(self.ndim) if axis not in axes]
         before = [axis for axis in others if axis < first]
         after = [axis for axis in others if axis >= first]
-        jumps = [sum(i * self.strides[axis] for i, axis in zip(tuple_, axes)) for tuple_ in zip(*chosen)]
+        jumps = [sum(i * self.strides[axis] for i, axis in zip(tuple_, axes, strict=True)) for tuple_ in zip(*chosen, strict=False)]
         lead = positions([self.shape[axis] for axis in before], [self.strides[axis] for axis in before], self.offset)
         tail = positions([self.shape[axis] for axis in after], [self.strides[axis] for axis in after], 0)
         places = [a + b + c for a in lead for b in jumps for c in tail]
@@ -362,7 +314,7 @@ class Tensor:
 
             def send_back(gradient: Tensor) -> tuple[Tensor]:
                 numbers = [0.0] * count(self.shape)
-                for place, value in zip(places, gradient.flat()):
+                for place, value in zip(places, gradient.flat(), strict=True):
                     numbers[order[place]] += value
                 return (Tensor(Storage(numbers), self.shape, self.dtype),)
 
@@ -375,18 +327,20 @@ class Tensor:
         self._write_places(positions(self.shape, self.strides, self.offset), self.shape, value, spread(value, self.shape))
         return self
 
-    def _write_places(self, places: Sequence[int], shape: Sequence[int], value: Tensor, numbers: list[Any]) -> None:
-        """Write to `places` of the row. Whatever the tensor is a view of has a new step from now on, and so have its other views."""
+    def refuse_if_leaf(self) -> Tensor:
+        """What this tensor is a view of in the end; a leaf of the graph can't be changed in place while steps are recorded."""
         owner = self
         while owner.base is not None:
             owner = owner.base
         if is_recording() and owner.requires_grad and owner.grad_fn is None:
-            raise RuntimeError(
-                "a leaf Variable that requires grad is being used in an in-place operation."
-                if owner is self
-                else "a view of a leaf Variable that requires grad is being used in an in-place operation."
-            )
-        for place, number in zip(places, self.dtype.numbers(numbers)):
+            what = "a leaf Variable that requires grad" if owner is self else "a view of a leaf Variable that requires grad"
+            raise RuntimeError(f"{what} is being used in an in-place operation.")
+        return owner
+
+    def _write_places(self, places: Sequence[int], shape: Sequence[int], value: Tensor, numbers: list[Any]) -> None:
+        """Write to `places` of the row. Whatever the tensor is a view of has a new step from now on, and so have its other views."""
+        owner = self.refuse_if_leaf()
+        for place, number in zip(places, self.dtype.numbers(numbers), strict=True):
             self.storage.numbers[place] = number
         self.storage.version += 1
         if not is_recording() or not (owner.requires_grad or value.requires_grad):
@@ -411,24 +365,10 @@ class Tensor:
 # -------------------------------------------------------------------------------------------------------- shapes that meet
 
 
-def broadcast_shapes(*shapes: Sequence[int]) -> tuple[int, ...]:
-    """The shape that all have together. Raises RuntimeError if there is none."""
-    result: list[int] = []
-    for shape in shapes:
-        padded = [1] * (len(result) - len(shape)) + list(shape)
-        result = [1] * (len(padded) - len(result)) + result
-        for axis in reversed(range(len(result))):
-            a, b = result[axis], padded[axis]
-            if a != b and a != 1 and b != 1:
-                raise RuntimeError(f"The size of tensor a ({a}) must match the size of tensor b ({b}) at non-singleton dimension {axis}")
-            result[axis] = b if a == 1 else a
-    return tuple(result)
-
-
 def spread_strides(tensor: Tensor, shape: Sequence[int]) -> tuple[int, ...]:
     """Strides with which a tensor has this larger shape: 0 along the axes that it lacks."""
     lacking = len(shape) - tensor.ndim
-    own = [0 if size == 1 and want != 1 else stride for size, stride, want in zip(tensor.shape, tensor.strides, shape[lacking:])]
+    own = [0 if size == 1 and want != 1 else stride for size, stride, want in zip(tensor.shape, tensor.strides, shape[lacking:], strict=True)]
     return (*[0] * lacking, *own)
 
 
@@ -457,8 +397,8 @@ def sum_to(tensor: Tensor, shape: Sequence[int]) -> Tensor:
         return tensor
     numbers = [0.0] * count(shape)
     lead = tensor.ndim - len(shape)
-    steps = [0] * lead + [0 if size == 1 else stride for size, stride in zip(shape, strides_of(shape))]
-    for place, value in zip(positions(tensor.shape, steps, 0), tensor.flat()):
+    steps = [0] * lead + [0 if size == 1 else stride for size, stride in zip(shape, strides_of(shape), strict=True)]
+    for place, value in zip(positions(tensor.shape, steps, 0), tensor.flat(), strict=True):
         numbers[place] += value
     return Tensor(Storage(numbers), shape, tensor.dtype)
 
@@ -472,7 +412,7 @@ def _is_mask(entry: Any) -> bool:
 
 def _as_index(entry: Any) -> Any:
     if isinstance(entry, bool):
-        raise Missing("an index of True or False is not in the page's torch; it is in the notebook")
+        raise Missing("torch.Tensor with an index of True or False")
     if entry is None or entry is Ellipsis or isinstance(entry, (int, slice)):
         if isinstance(entry, slice):
             return slice(*(None if part is None else part.__index__() for part in (entry.start, entry.stop, entry.step)))
@@ -491,7 +431,7 @@ def _as_index(entry: Any) -> Any:
 
 def _as_integers(mask: Tensor) -> list[Tensor]:
     """The places where a mask is True, as one tensor of integers for each of its axes."""
-    found = [index for index, kept in zip(itertools.product(*map(range, mask.shape)), mask.flat()) if kept]
+    found = [index for index, kept in zip(itertools.product(*map(range, mask.shape)), mask.flat(), strict=True) if kept]
     return [Tensor(Storage([index[axis] for index in found]), (len(found),), dtypes.int64) for axis in range(mask.ndim)]
 
 
@@ -501,10 +441,12 @@ def from_nested(value: Any, kind: dtypes.dtype | None = None) -> Tensor:
         return Tensor(Storage((kind or value.dtype).numbers(value.flat())), value.shape, kind or value.dtype)
     shape: list[int] = []
     level = [value]
-    while level and isinstance(level[0], (list, tuple, range)) or (level and isinstance(level[0], Tensor) and level[0].shape):
+    while (level and isinstance(level[0], (list, tuple, range))) or (level and isinstance(level[0], Tensor) and level[0].shape):
         sizes = [len(entry) if hasattr(entry, "__len__") else -1 for entry in level]
         if len(set(sizes)) > 1:
-            raise ValueError(f"expected sequence of length {sizes[0]} at dim {len(shape)} (got {next(s for s in sizes if s != sizes[0])})")
+            raise ValueError(
+                f"expected sequence of length {sizes[0]} at dim {len(shape)} (got {next(s for s in sizes if s != sizes[0])})"
+            )
         shape.append(sizes[0])
         level = [part for entry in level for part in entry]
     kinds = [entry.dtype if isinstance(entry, Tensor) else dtypes.of_number(entry) for entry in level]
