@@ -10,6 +10,8 @@ import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from .missing import missing
+
 _recording = [True]
 
 
@@ -222,3 +224,7 @@ class set_grad_enabled(_Switch):
     def __exit__(self, *exc: object) -> None:
         _recording.pop()
         _recording[-1] = self._before
+
+
+def __getattr__(name: str) -> Any:
+    raise missing("torch.autograd", name)

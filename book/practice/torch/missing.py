@@ -25,10 +25,10 @@ OWNERS = {
 
 
 class Missing(AttributeError):
-    """Something of torch that the page does not have, though the notebook does."""
+    """Something that the page does not have, though the notebook does."""
 
-    def __init__(self, what: str) -> None:
-        super().__init__(f"{what} is not in the page's torch; it is in the notebook")
+    def __init__(self, what: str, where: str = "the page's torch") -> None:
+        super().__init__(f"{what} is not in {where}; it is in the notebook")
         asked_for.append(str(self))
 
 
