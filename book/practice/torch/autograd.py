@@ -44,6 +44,7 @@ class Node:
 
     def result_is_written_to(self, result: Any, target: Any) -> None:
         """The result now lives in another tensor, over which it was written: that one must not change, then."""
+        self.result = target
         self.relies_on = [
             (target, target.storage.version) if one is result else (one, version) for one, version in self.relies_on
         ]

@@ -88,7 +88,7 @@ def index_select(input: Tensor, dim: int, index: Tensor) -> Tensor:
         if count(index.shape) != 1:
             raise RuntimeError(f"index_select(): Index to scalar can have only 1 value, got {count(index.shape)} value(s)")
         return input.reshape(1)[index.reshape(1)].reshape(())
-    if count(index.shape) and not input.shape[axis]:
+    if count(index.shape) and not input.shape[axis] and input.ndim > 1:
         raise RuntimeError("index_select(): self indexing axis dim should be positive")
     if any(not 0 <= entry < input.shape[axis] for entry in index.flat()):
         raise IndexError("index out of range in self")

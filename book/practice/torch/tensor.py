@@ -424,7 +424,7 @@ class Tensor:
             to_value = Tensor(Storage([kept[place] for place in written]), shape, gradient.dtype)
             for place in written:
                 kept[place] = 0.0
-            return Tensor(Storage(kept), gradient.shape, gradient.dtype), sum_to(to_value, value.shape)
+            return Tensor(Storage(kept), gradient.shape, gradient.dtype), _as_kind(sum_to(to_value, value.shape), value.dtype)
 
         owner.step = Node("torch::autograd::CopySlices", (owner, value), send_back)
         owner.requires_grad = True
@@ -499,6 +499,11 @@ def meet_halfway(a: Tensor, b: Tensor) -> bool:
     if not one or not other or any(max(p) - min(p) + 1 != len(set(p)) for p in (one, other)):
         return False
     return one != other and max(min(one), min(other)) <= min(max(one), max(other))
+
+
+def _as_kind(gradient: Tensor, kind: dtypes.dtype) -> Tensor:
+    """The gradient in the kind of what it belongs to."""
+    return gradient if gradient.dtype is kind else Tensor(Storage(kind.numbers(gradient.flat())), gradient.shape, kind)
 
 
 def _is_mask(entry: Any) -> bool:

@@ -32,7 +32,8 @@ def loaded() -> Any:
 
 page = loaded()
 SAME_TEXT = (
-    "Trying to backward", "element 0 of tensors", "grad can be implicitly", "One of the differentiated", "a leaf Variable", "a view of a leaf",
+    "Trying to backward", "element 0 of tensors", "grad can be implicitly", "One of the differentiated", "a leaf Variable",
+    "a view of a leaf",
     "Negation", "Subtraction", "~ (operator", "The size of tensor a", "mat1 and mat2", "shape '", "view size is not", "stack expects",
     "Sizes of tensors must match", "Dimension out of range", "too many indices", "The shape of the mask", "Boolean value of Tensor",
     "a Tensor with", "only one element tensors", "mean(): could not", "std and var only", "argument 'input'", "where expected condition",
@@ -43,32 +44,50 @@ SAME_TEXT = (
 """How errors begin, or what is in them, whose whole text is the same."""
 
 FUNCTIONS = """
-{a} + {b}; {a} - {b}; {a} * {b}; {a} / {b}; {a} // {b}; {a} % {b}; {a} ** {b}; {a} @ {b}; {a} == {b}; {a} < {b}; {a} >= {b}; {a} != {b}; {a} & {b}; {a} ^ {b}; {a} | {b}
--{a}; ~{a}; abs({a}); {a} + 1; {a} * 2.5; 1 - {a}; 2 / {a}; {a} ** 2; {a} ** -1; 2 ** {a}; {a} // 2; {a} % 3; {a} % 2.0; {a} > 0; {a} == 1; 0.1 < {a}; {a} + True; True - {a}; {a} * 3 - {a}
-T.exp({a}); {a}.log(); {a}.sqrt(); {a}.sigmoid(); T.tanh({a}); {a}.abs(); {a}.sign(); {a}.square(); {a}.floor(); {a}.ceil(); {a}.round(); T.relu({a}); {a}.log1p(); {a}.expm1(); {a}.reciprocal()
-{a}.rsqrt(); {a}.isnan(); {a}.isinf(); {a}.isfinite(); {a}.logical_not(); {a}.erf(); {a}.neg(); {a}.sin(); {a}.cos(); {a}.log2(); {a}.nan_to_num(); {a}.atanh(); T.special.ndtr({a}); T.logit({a})
-T.minimum({a}, {b}); T.maximum({a}, {b}); T.min({a}, {b}); {a}.max({b}); {a}.clamp(-0.5, 0.5); {a}.clamp(min=0); T.clamp({a}, max=1.0); {a}.clamp(min={b}); T.where({m}, {a}, {b}); T.where({m}, {a}, 0)
-T.where({m}, 0.5, {a}); {a}.masked_fill({m}, 0); {a}.masked_fill({m}, -float("inf")); {a}.where({m}, {b}); T.where({a} > 0, {a}, {b}); {a}.logical_and({b}); T.isclose({a}, {b}); {a}.eq({b}); T.where({a}, 1, 0)
-{a}.sum(); {a}.sum({d}); {a}.sum({d}, keepdim=True); {a}.mean(); {a}.mean({d}); {a}.mean({d}, True); {a}.prod(); {a}.prod({d}); {a}.std(); {a}.std({d}); {a}.var({d}, unbiased=False); {a}.var(correction=0)
-{a}.std({d}, correction=0, keepdim=True); {a}.max(); {a}.min(); {a}.max({d}).values; {a}.max({d})[1]; {a}.min({d}, keepdim=True)[0]; {a}.amax({d}); {a}.argmax(); {a}.argmax({d}); {a}.argmin({d}, keepdim=True)
-{a}.any(); {a}.all({d}); {a}.any({d}, keepdim=True); {a}.count_nonzero(); {a}.norm(); {a}.norm(dim={d}); {a}.logsumexp({d}); {a}.logsumexp({d}, keepdim=True); {a}.sum((0, 1)); {a}.mean((0, -1)); {a}.nansum()
-{a}.sum(dtype=T.float64); {a}.sum(axis={d}); {a}.softmax({d}); {a}.log_softmax({d}); T.softmax({a}, dim={d}); {a}.cumsum({d}); {a}.cummax({d}).values; {a}.sort({d}).values; {a}.sort({d}, descending=True)[0]
-{a}.sort(stable=True)[1]; {a}.argsort(); T.topk({a}, 2).values; {a}.diff(); {a}.quantile(0.3); {a}.median(); {a}.logcumsumexp({d}); T.gather({a}, {d}, {i}); {a}.gather({d}, {i}); {a}[{i}]; {a}[{m}]
-{a}.masked_select({m}); {a}.nonzero(); {a}.flip(0); {a}.roll(1, 0); T.cat([{a}, {b}]); T.cat([{a}, {b}], {d}); T.stack([{a}, {b}]); T.stack([{a}, {b}, {c}], dim={d}); {a}.tril(); {a}.triu(1); {a}.repeat_interleave(2, 0)
-{a}.reshape(-1); {a}.view(-1); {a}.reshape(2, -1); {a}.view(3, 2); {a}.flatten(); {a}.unsqueeze({d}); {a}.squeeze(); {a}.squeeze({d}); {a}.t(); {a}.T; {a}.mT; {a}.transpose(0, 1); {a}.permute(1, 0); {a}.expand(2, 3)
-{a}.expand_as({b}); {a}.narrow({d}, 0, 1); {a}.unbind({d})[0]; {a}.split(2)[0]; {a}.chunk(2, {d})[-1]; T.broadcast_to({a}, {b}.shape); {a}.contiguous(); {a}.clone(); {a}.detach(); {a}[0]; {a}[-1]; {a}[1:]; {a}[:-1]
-{a}[..., 0]; {a}[:, 0]; {a}[:, None]; {a}[None]; {a}[::2]; {a}[0, 1:]; {a}[..., -1:]; {a}[{a} > 0]; {a}[[0, 1]]; {a}[True]; {a}.mm({b}); T.matmul({a}, {b}); T.dot({a}, {b}); {a} @ {a}.transpose(-1, -2); T.outer({a}, {b})
-{a}.float(); {a}.double(); {a}.long(); {a}.bool(); {a}.to(T.float64); {a}.to({b}.dtype); {a}.type_as({b}); {a}.half(); {a}.bfloat16(); T.zeros_like({a}); T.ones_like({a}, dtype=T.float64); T.full_like({a}, 2.5)
-{a}.new_zeros(2); T.tensor({a}.tolist()); T.tensor([{a}.sum(), 2.0]); T.stack(list({a})); T.tensor(len({a})); T.tensor({a}.shape); T.tensor(float({a})); T.tensor({a}.item()); T.tensor(int({a})); T.arange({a}.shape[0])
-T.linspace(0, 1, 5); T.eye(3); T.full((2,), True); T.tensor(bool({a})); T.tensor([float(v) for v in {a}]); sum({a}); T.tensor(1 if {a}.any() else 0); T.arange(0, 1, 0.3); T.arange(3, 0, -1); {a} + [1, 2]; {a} + None
-F.logsigmoid({a}); F.softplus({a}); F.softmax({a}, dim=-1); F.log_softmax({a}, {d}); F.relu({a}); F.mse_loss({a}, {b}); F.l1_loss({a}, {b}, reduction="sum"); F.smooth_l1_loss({a}, {b}); F.huber_loss({a}, {a} * 0.3, delta=0.5)
-F.binary_cross_entropy_with_logits({a}.double(), {a}.double()); F.one_hot({i}, 4); F.pad({a}, (1, 0)); F.pad({a}, (0, 1), value=2.0); F.normalize({a}, dim=-1); {a}.foo; T.foo({a}); T.stack([]); T.exp(2.0); T.sum([1, 2]); {a} * "a"
-T.exp({a}, foo=1); T.corrcoef({a}); T.cov({a}); T.xlogy({a}, {b}); F.silu({a}); T.lerp({a}, {b}, 0.3); T.logaddexp({a}, {b}); {a}.index_select(0, {i}); T.hstack([{a}, {b}]); {a}.scatter(0, {i}, 1.0)
+{a} + {b}; {a} - {b}; {a} * {b}; {a} / {b}; {a} // {b}; {a} % {b}; {a} ** {b}; {a} @ {b}; {a} == {b}; {a} < {b}; {a} >= {b}
+{a} != {b}; {a} & {b}; {a} ^ {b}; {a} | {b}; -{a}; ~{a}; abs({a}); {a} + 1; {a} * 2.5; 1 - {a}; 2 / {a}; {a} ** 2; {a} ** -1
+2 ** {a}; {a} // 2; {a} % 3; {a} % 2.0; {a} > 0; {a} == 1; 0.1 < {a}; {a} + True; True - {a}; {a} * 3 - {a}; T.exp({a})
+{a}.log(); {a}.sqrt(); {a}.sigmoid(); T.tanh({a}); {a}.abs(); {a}.sign(); {a}.square(); {a}.floor(); {a}.ceil(); {a}.round()
+T.relu({a}); {a}.log1p(); {a}.expm1(); {a}.reciprocal(); {a}.rsqrt(); {a}.isnan(); {a}.isinf(); {a}.isfinite()
+{a}.logical_not(); {a}.erf(); {a}.neg(); {a}.sin(); {a}.cos(); {a}.log2(); {a}.nan_to_num(); {a}.atanh(); T.special.ndtr({a})
+T.logit({a}); T.minimum({a}, {b}); T.maximum({a}, {b}); T.min({a}, {b}); {a}.max({b}); {a}.clamp(-0.5, 0.5); {a}.clamp(min=0)
+T.clamp({a}, max=1.0); {a}.clamp(min={b}); T.where({m}, {a}, {b}); T.where({m}, {a}, 0); T.where({m}, 0.5, {a})
+{a}.masked_fill({m}, 0); {a}.masked_fill({m}, -float("inf")); {a}.where({m}, {b}); T.where({a} > 0, {a}, {b})
+{a}.logical_and({b}); T.isclose({a}, {b}); {a}.eq({b}); T.where({a}, 1, 0); {a}.sum(); {a}.sum({d}); {a}.sum({d}, keepdim=True)
+{a}.mean(); {a}.mean({d}); {a}.mean({d}, True); {a}.prod(); {a}.prod({d}); {a}.std(); {a}.std({d}); {a}.var({d}, unbiased=False)
+{a}.var(correction=0); {a}.std({d}, correction=0, keepdim=True); {a}.max(); {a}.min(); {a}.max({d}).values; {a}.max({d})[1]
+{a}.min({d}, keepdim=True)[0]; {a}.amax({d}); {a}.argmax(); {a}.argmax({d}); {a}.argmin({d}, keepdim=True); {a}.any()
+{a}.all({d}); {a}.any({d}, keepdim=True); {a}.count_nonzero(); {a}.norm(); {a}.norm(dim={d}); {a}.logsumexp({d})
+{a}.logsumexp({d}, keepdim=True); {a}.sum((0, 1)); {a}.mean((0, -1)); {a}.nansum(); {a}.sum(dtype=T.float64); {a}.sum(axis={d})
+{a}.softmax({d}); {a}.log_softmax({d}); T.softmax({a}, dim={d}); {a}.cumsum({d}); {a}.cummax({d}).values; {a}.sort({d}).values
+{a}.sort({d}, descending=True)[0]; {a}.sort(stable=True)[1]; {a}.argsort(); T.topk({a}, 2).values; {a}.diff(); {a}.quantile(0.3)
+{a}.median(); {a}.logcumsumexp({d}); T.gather({a}, {d}, {i}); {a}.gather({d}, {i}); {a}[{i}]; {a}[{m}]; {a}.masked_select({m})
+{a}.nonzero(); {a}.flip(0); {a}.roll(1, 0); T.cat([{a}, {b}]); T.cat([{a}, {b}], {d}); T.stack([{a}, {b}])
+T.stack([{a}, {b}, {c}], dim={d}); {a}.tril(); {a}.triu(1); {a}.repeat_interleave(2, 0); {a}.reshape(-1); {a}.view(-1)
+{a}.reshape(2, -1); {a}.view(3, 2); {a}.flatten(); {a}.unsqueeze({d}); {a}.squeeze(); {a}.squeeze({d}); {a}.t(); {a}.T; {a}.mT
+{a}.transpose(0, 1); {a}.permute(1, 0); {a}.expand(2, 3); {a}.expand_as({b}); {a}.narrow({d}, 0, 1); {a}.unbind({d})[0]
+{a}.split(2)[0]; {a}.chunk(2, {d})[-1]; T.broadcast_to({a}, {b}.shape); {a}.contiguous(); {a}.clone(); {a}.detach(); {a}[0]
+{a}[-1]; {a}[1:]; {a}[:-1]; {a}[..., 0]; {a}[:, 0]; {a}[:, None]; {a}[None]; {a}[::2]; {a}[0, 1:]; {a}[..., -1:]; {a}[{a} > 0]
+{a}[[0, 1]]; {a}[True]; {a}.mm({b}); T.matmul({a}, {b}); T.dot({a}, {b}); {a} @ {a}.transpose(-1, -2); T.outer({a}, {b})
+{a}.float(); {a}.double(); {a}.long(); {a}.bool(); {a}.to(T.float64); {a}.to({b}.dtype); {a}.type_as({b}); {a}.half()
+{a}.bfloat16(); T.zeros_like({a}); T.ones_like({a}, dtype=T.float64); T.full_like({a}, 2.5); {a}.new_zeros(2)
+T.tensor({a}.tolist()); T.tensor([{a}.sum(), 2.0]); T.stack(list({a})); T.tensor(len({a})); T.tensor({a}.shape)
+T.tensor(float({a})); T.tensor({a}.item()); T.tensor(int({a})); T.arange({a}.shape[0]); T.linspace(0, 1, 5); T.eye(3)
+T.full((2,), True); T.tensor(bool({a})); T.tensor([float(v) for v in {a}]); sum({a}); T.tensor(1 if {a}.any() else 0)
+T.arange(0, 1, 0.3); T.arange(3, 0, -1); {a} + [1, 2]; {a} + None; F.logsigmoid({a}); F.softplus({a}); F.softmax({a}, dim=-1)
+F.log_softmax({a}, {d}); F.relu({a}); F.mse_loss({a}, {b}); F.l1_loss({a}, {b}, reduction="sum"); F.smooth_l1_loss({a}, {b})
+F.huber_loss({a}, {a} * 0.3, delta=0.5); F.binary_cross_entropy_with_logits({a}.double(), {a}.double()); F.one_hot({i}, 4)
+F.pad({a}, (1, 0)); F.pad({a}, (0, 1), value=2.0); F.normalize({a}, dim=-1); {a}.foo; T.foo({a}); T.stack([]); T.exp(2.0)
+T.sum([1, 2]); {a} * "a"; T.exp({a}, foo=1); T.corrcoef({a}); T.cov({a}); T.xlogy({a}, {b}); F.silu({a}); T.lerp({a}, {b}, 0.3)
+T.logaddexp({a}, {b}); {a}.index_select(0, {i}); T.hstack([{a}, {b}]); {a}.scatter(0, {i}, 1.0)
 """
 CHANGES = """
-{a} += {b}; {a} -= 1; {a} *= {b}; {a} /= 2; {a} **= 2; {a}[0] = {b} * 1; {a}[0] = 1.5; {a}[:, 0] = 0; {a}[{m}] = 0; {a}[{m}] = {b} * 1; {a}[{i}] = 2; {a}[1:] += 1; {a}[..., -1] *= 2; {a}.add_({b}); {a}.mul_(0.5); {a}.clamp_(min=0)
-{a}.zero_(); {a}.fill_(2); {a}.exp_(); {a}.masked_fill_({m}, 1); {a}[{a} > 0] = 0; {a}[:-1] = {a}[1:]; {a}[0] += {b}; {a}.relu_(); {a}.sigmoid_(); {a}.sub_({b}, alpha=2); {a}.T[0] = 3; {a}.view(-1)[0] = 7
-{a}[:] = {b} * 1; {a}[None][0] = 2; {a}[..., 0] = {b}; {a}.squeeze()[0] = 1; {a}.detach().add_(1); {a}.div_({b}); {a}[-1] -= {b}; {a}.unsqueeze(0).mul_(2); {a}.t().add_({b}); {a}.sqrt_(); {a}.pow_(2); {a}.tanh_(); {a}.neg_(); {a}.abs_()
+{a} += {b}; {a} -= 1; {a} *= {b}; {a} /= 2; {a} **= 2; {a}[0] = {b} * 1; {a}[0] = 1.5; {a}[:, 0] = 0; {a}[{m}] = 0
+{a}[{m}] = {b} * 1; {a}[{i}] = 2; {a}[1:] += 1; {a}[..., -1] *= 2; {a}.add_({b}); {a}.mul_(0.5); {a}.clamp_(min=0); {a}.zero_()
+{a}.fill_(2); {a}.exp_(); {a}.masked_fill_({m}, 1); {a}[{a} > 0] = 0; {a}[:-1] = {a}[1:]; {a}[0] += {b}; {a}.relu_()
+{a}.sigmoid_(); {a}.sub_({b}, alpha=2); {a}.T[0] = 3; {a}.view(-1)[0] = 7; {a}[:] = {b} * 1; {a}[None][0] = 2; {a}[..., 0] = {b}
+{a}.squeeze()[0] = 1; {a}.detach().add_(1); {a}.div_({b}); {a}[-1] -= {b}; {a}.unsqueeze(0).mul_(2); {a}.t().add_({b})
+{a}.sqrt_(); {a}.pow_(2); {a}.tanh_(); {a}.neg_(); {a}.abs_()
 """
 
 

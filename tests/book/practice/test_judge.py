@@ -13,6 +13,7 @@ from autograder.authoring import chapter, freeze
 from autograder.authoring.spec import Exercise
 from autograder.checks import exercises
 from autograder.proving import practice
+from course_lib import validate
 from course_lib.checks.results import examined
 
 OFFERED = ["importance_ratio", "clipped_surrogate_loss"]
@@ -56,7 +57,11 @@ def told(folder):
     return told
 
 
-RATIO = "def importance_ratio(new_log_probs, old_log_probs):\n"
+RATIO = (
+    "def importance_ratio(new_log_probs, old_log_probs):\n"
+    "    validate.same_shape(new_log_probs=new_log_probs, old_log_probs=old_log_probs)\n"
+)
+EINSUM = "torch.einsum is not in the page's torch; it is in the notebook"
 
 
 def test_a_page_says_what_the_notebook_says(told, folder):
@@ -67,7 +72,7 @@ def test_a_page_says_what_the_notebook_says(told, folder):
     frozen = freeze.visible(
         next(one for one in exercises("ch43") if isinstance(one, Exercise) and one.name == "importance_ratio")
     )
-    namespace: dict = {}
+    namespace = {"validate": validate}
     exec(wrong, namespace)
     expected = examined(frozen, namespace["importance_ratio"])
     assert mistaken["message"] == expected.finding.message
@@ -81,12 +86,12 @@ def test_a_page_says_what_the_notebook_says(told, folder):
     ("source", "state", "message"),
     [
         (RATIO + "    raise NotImplementedError", "not_implemented", "Not implemented yet."),
-        (RATIO + "    return torch.einsum('i->i', new_log_probs)", "error", "torch.einsum is not in the page's torch; it is in the notebook"),
+        (RATIO + "    return torch.einsum('i->i', new_log_probs)", "error", EINSUM),
         (RATIO + "    try:\n        return torch.einsum('i->i', new_log_probs)\n    except Exception:\n        return 0", "error",
-         "torch.einsum is not in the page's torch; it is in the notebook"),
+         EINSUM),
         ("import numpy as np\n" + RATIO + "    return np.exp(new_log_probs - old_log_probs)", "error",
          "numpy is not in the page; it is in the notebook"),
-        (RATIO + "    return 1 +", "error", "SyntaxError: invalid syntax in line 2: return 1 +"),
+        (RATIO + "    return 1 +", "error", "SyntaxError: invalid syntax in line 3: return 1 +"),
         ("ratio = 1 / 0", "error", "ZeroDivisionError: division by zero in line 1: ratio = 1 / 0"),
         ("x = 1", "error", "The cell defines no function importance_ratio."),
         ("%matplotlib inline\n!ls\n" + RATIO + "    return (new_log_probs - old_log_probs).exp()", "correct", ""),
@@ -109,6 +114,6 @@ def test_an_exercise_may_use_the_readers_own_answer_to_another(told):
         "def clipped_surrogate_loss(new_log_probs, old_log_probs, advantages, clip_range=0.2):\n"
         "    print(importance_ratio.__doc__)\n    raise NotImplementedError\n"
     )
-    own = RATIO + "    'mine'\n    return (new_log_probs - old_log_probs).exp()\n"
+    own = "def importance_ratio(new_log_probs, old_log_probs):\n    'mine'\n    return (new_log_probs - old_log_probs).exp()\n"
     (theirs, mine), _ = told(("clipped_surrogate_loss", loss), ("clipped_surrogate_loss", loss, {"importance_ratio": own}))
     assert "mine" in mine["printed"] and "mine" not in theirs["printed"] and theirs["printed"]
