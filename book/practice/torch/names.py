@@ -193,11 +193,13 @@ def _equip() -> None:
         "expand_as": lambda self, other: self.expand(other.shape),
         "reshape_as": lambda self, other: self.reshape(other.shape),
         "type_as": lambda self, other: self.to(other.dtype),
-        "new_tensor": lambda self, data, *, dtype=None: making.tensor(data, dtype=dtype or self.dtype),
-        "new_zeros": lambda self, *size, dtype=None: making.zeros(*size, dtype=dtype or self.dtype),
-        "new_ones": lambda self, *size, dtype=None: making.ones(*size, dtype=dtype or self.dtype),
-        "new_empty": lambda self, *size, dtype=None: making.zeros(*size, dtype=dtype or self.dtype),
-        "new_full": lambda self, size, fill_value, *, dtype=None: making.full(size, fill_value, dtype=dtype or self.dtype),
+        "new_tensor": lambda self, data, *, dtype=None, device=None: making.tensor(data, dtype=dtype or self.dtype),
+        "new_zeros": lambda self, *size, dtype=None, device=None: making.zeros(*size, dtype=dtype or self.dtype),
+        "new_ones": lambda self, *size, dtype=None, device=None: making.ones(*size, dtype=dtype or self.dtype),
+        "new_empty": lambda self, *size, dtype=None, device=None: making.zeros(*size, dtype=dtype or self.dtype),
+        "new_full": lambda self, size, fill_value, *, dtype=None, device=None: making.full(
+            size, fill_value, dtype=dtype or self.dtype
+        ),
     }
     for method, kind in _CONVERSIONS:
         methods[method] = lambda self, _kind=kind: self.to(_kind)

@@ -16,11 +16,21 @@ from .moving import picked
 from .shapes import axes_of, axis_of, count, positions, strides_of
 from .tensor import Storage, Tensor
 
+
+def _named(name: str, *fields: str) -> Any:
+    """A named tuple that shows itself as torch's do."""
+
+    def shown(self: Any) -> str:
+        entries = ",\n".join(f"{field}={value!r}" for field, value in zip(fields, self, strict=True))
+        return f"torch.return_types.{name}(\n{entries})"
+
+    return type(name, (namedtuple(name, fields),), {"__repr__": shown, "__slots__": ()})
+
+
 VALUES_AND_PLACES: dict[str, Any] = {
-    name: namedtuple(name, ["values", "indices"])
-    for name in ("min", "max", "sort", "topk", "cummax", "median", "kthvalue", "cummin")
+    name: _named(name, "values", "indices") for name in ("min", "max", "sort", "topk", "cummax", "cummin", "median", "kthvalue")
 }
-VALUES_AND_PLACES["aminmax"] = namedtuple("aminmax", ["min", "max"])
+VALUES_AND_PLACES["aminmax"] = _named("aminmax", "min", "max")
 
 
 def groups_of(x: Tensor, axes: Sequence[int]) -> tuple[list[list[Any]], list[list[int]], tuple[int, ...]]:

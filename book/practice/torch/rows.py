@@ -202,6 +202,8 @@ def _cumulative(name: str, better: Callable) -> Callable:
     def function(input: Tensor, dim: int) -> Any:
         if not input.ndim and dim not in (-1, 0):
             raise IndexError(f"{name}(): Expected reduction dim -1 or 0 for scalar but got {dim}")
+        if not count(input.shape):
+            return VALUES_AND_PLACES[name](input.clone(), make([], input.shape, dtypes.int64))
         places = _along(name, input, dim, _running_best(better), None, dtypes.int64)
         return VALUES_AND_PLACES[name](picked(input, dim, places), places)
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from . import dtypes
 from .autograd import Leaf, Node, accumulate, is_recording
 from .missing import Missing, missing
+from .printing import shown
 from .shapes import Size, axis_of, broadcast_shapes, count, positions, strides_of
 
 
@@ -189,10 +190,13 @@ class Tensor:
         return format(self.item(), spec) if not self.shape else format(repr(self), spec)
 
     def __repr__(self) -> str:
-        body = _shown(self.tolist(), self.dtype, len("tensor("))
+        if count(self.shape) > 1000:
+            raise Missing("printing of more than 1000 entries")
+        body = shown(self.flat(), self.tolist(), self.shape, len("tensor(")) if count(self.shape) else "[]"
+        size = f", size={tuple(self.shape)}" if not count(self.shape) and self.ndim > 1 else ""
         kind = "" if self.dtype in (dtypes.float32, dtypes.int64, dtypes.bool_) else f", dtype={self.dtype}"
         grad = f", grad_fn=<{self.grad_fn.name}>" if self.grad_fn else ", requires_grad=True" if self.requires_grad else ""
-        return f"tensor({body}{kind}{grad})"
+        return f"tensor({body}{size}{kind}{grad})"
 
     def numpy(self) -> Any:
         raise Missing("Tensor.numpy")
@@ -588,12 +592,3 @@ def from_nested(value: Any, kind: dtypes.dtype | None = None) -> Tensor:
 
 def _tensor_of(value: Any, kind: dtypes.dtype) -> Tensor:
     return value if isinstance(value, Tensor) else from_nested(value, kind)
-
-
-def _shown(value: Any, kind: dtypes.dtype, indent: int) -> str:
-    if not isinstance(value, list):
-        return f"{value:.4f}" if kind.is_floating_point and value == value and abs(value) != float("inf") else str(value)
-    if not value or not isinstance(value[0], list):
-        return f"[{', '.join(_shown(entry, kind, 0) for entry in value)}]"
-    inner = (",\n" + " " * (indent + 1)).join(_shown(entry, kind, indent + 1) for entry in value)
-    return f"[{inner}]"

@@ -15,8 +15,8 @@ from both_torches import Program, Tensor, difference, drawn, page
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-EXAMPLES = int(os.environ.get("PRACTICE_EXAMPLES", "600"))
-LONG = EXAMPLES > 600
+EXAMPLES = int(os.environ.get("PRACTICE_EXAMPLES", "1500"))
+LONG = EXAMPLES > 1500
 randomly = settings(
     max_examples=EXAMPLES, deadline=None, database=None, derandomize=not LONG, suppress_health_check=list(HealthCheck)
 )
@@ -218,6 +218,50 @@ def test_what_is_lacking_is_named(expression, what):
     with pytest.raises(AttributeError) as caught:
         eval(expression, {"T": page, "F": page.nn.functional, "x": page.ones(2)})
     assert str(caught.value) == f"{what} is not in the page's torch; it is in the notebook"
+
+
+@pytest.mark.parametrize(
+    "expression",
+    [
+        *(
+            "T.tensor(1.5)",
+            "T.tensor([1.0, 2.0])",
+            "T.tensor([0.1, 0.25])",
+            "T.tensor([[1.0, -2.5], [0.0, 3.25]])",
+            "T.tensor([1, -20])",
+        ),
+        *(
+            "T.tensor([True, False])",
+            "T.tensor([1e-6, 1.0])",
+            "T.tensor([1.0, 1e9])",
+            "T.tensor([1.0, float('nan'), float('-inf')])",
+        ),
+        *(
+            "T.arange(40).float() / 7",
+            "T.zeros(2, 2, 3)",
+            "T.zeros(0)",
+            "T.zeros(0, 3)",
+            "T.ones(2, dtype=T.float64) / 3",
+            "T.tensor(7)",
+        ),
+        *(
+            "T.ones(2, requires_grad=True)",
+            "T.ones(2, requires_grad=True) * 2",
+            "T.ones(2, requires_grad=True).exp()",
+            "T.zeros(2, 1)",
+        ),
+        *(
+            "T.zeros(3).shape",
+            "T.float32",
+            "T.ones(2).max(0)",
+            "T.arange(3).int()",
+            "T.tensor([0.0, 0.0])",
+            "T.arange(60).reshape(2, 30)",
+        ),
+    ],
+)
+def test_tensors_show_themselves_alike(expression):
+    assert repr(eval(expression, {"T": page})) == repr(eval(expression, {"T": torch}))
 
 
 def test_it_has_no_name_that_torch_has_not():
