@@ -198,7 +198,8 @@ _QUESTIONS: dict[str, Callable] = {
     "signbit": lambda x: math.copysign(1, x) < 0,
 }
 _KEEPS_RESULT = {"exp", "expm1", "exp2", "sigmoid", "tanh", "sqrt", "rsqrt", "reciprocal", "relu"}
-_KEEPS_NOTHING = {"neg", "sign", "floor", "ceil", "round", "trunc"}
+_FLAT = {"sign", "floor", "ceil", "round", "trunc", "relu"}  # where nothing changes, not even an infinite gradient comes through
+_KEEPS_NOTHING = {"neg", "ndtr", "sign", "floor", "ceil", "round", "trunc"}
 _NOT_OF_TRUTH_VALUES = {
     "neg": "Negation, the `-` operator, on a bool tensor is not supported. If you are trying to invert a mask, use the `~` or"
     " `logical_not()` operator instead.",
@@ -227,7 +228,7 @@ def _of_one(name: str) -> Callable:
                 raise NotImplementedError(f"\"{_NOT_IMPLEMENTED_OF_TRUTH_VALUES[name]}_cpu\" not implemented for 'Bool'")
             compute, slope = _KEEPING_THEIR_KIND[name]
             kind = dtypes.int64 if input.dtype is dtypes.bool_ and name == "square" else None
-            return entrywise(name, compute, [slope], [input], kind, keeps, chooses=name == "relu")
+            return entrywise(name, compute, [slope], [input], kind, keeps, chooses=name in _FLAT)
         return entrywise(name, _QUESTIONS[name], None, [input], dtypes.bool_)
 
     function.__name__ = name

@@ -80,7 +80,7 @@ def _along(name: str, x: Tensor, axis: int, compute: Callable, send: Callable | 
             )
         ]
 
-    keeps = {"Cumprod": [x], "Softmax": [result], "LogSoftmax": [result]}.get(name, [])
+    keeps = {"Cumprod": [x, result], "Logcumsumexp": [x, result], "Softmax": [result], "LogSoftmax": [result]}.get(name, [])
     return record(result, f"{name}Backward0", [x], send_back, keeps)
 
 

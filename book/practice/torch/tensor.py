@@ -275,8 +275,8 @@ class Tensor:
             view.write(value)
             return
         places, shape = view._picked(rest)
-        value = _tensor_of(value, self.dtype)
-        if value.dtype is not self.dtype and count(value.shape) != 1:
+        given, value = value, _tensor_of(value, self.dtype)
+        if value.dtype is not self.dtype and (count(value.shape) != 1 or not self.ndim) and isinstance(given, Tensor):
             raise RuntimeError(
                 f"Index put requires the source and destination dtypes match, got {self.dtype.long_name} for the destination and"
                 f" {value.dtype.long_name} for the source."
