@@ -11,15 +11,17 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from autograder.authoring import artefacts, complaints
 from autograder.authoring.spec import Artefact, Case, Exercise
 from course_lib.checks import artefact as files
 from course_lib.checks import cells
-from course_lib.checks.cases import FrozenCase, FrozenExercise, Observation, save
+from course_lib.checks.cases import FrozenCase, FrozenExercise, Observation
 from course_lib.checks.diagnosis import differing_facets, signature, view, with_article
 from course_lib.checks.observing import observe
+from course_lib.checks.stored import save
 
 
 class FreezeError(ValueError):
@@ -147,5 +149,7 @@ def _plain(value: Any, dtype: torch.dtype) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(entry, dtype) for entry in value]
     if isinstance(value, torch.Tensor):
-        return (value.to(dtype) if value.is_floating_point() else value).numpy()
+        return (value.to(dtype) if value.is_floating_point() else value).detach().clone()
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(value.copy())
     return value

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import torch
 
 import course_lib
 from autograder import checks
@@ -30,11 +30,12 @@ from autograder.grading.sandbox import Sandbox, SandboxDied, SandboxError, Sandb
 from autograder.grading.verdicts import Item, Verdict, clean_text
 from autograder.paths import ROOT
 from course_lib.checks.artefact import FrozenArtefact
-from course_lib.checks.cases import FrozenExercise, Observation, decode, encode
+from course_lib.checks.cases import FrozenExercise, Observation
 from course_lib.checks.diagnosis import Finding, diagnose, view
 from course_lib.checks.names import WORD
 from course_lib.checks.notebook import NAMED, Stop, is_check, is_live
 from course_lib.checks.notebook import needed as needed_stops
+from course_lib.checks.stored import decode, encode
 
 WORKER = Path(__file__).with_name("worker.py")
 COURSE_LIB = Path(course_lib.__file__).parent
@@ -542,7 +543,7 @@ def _observation(data: Any) -> Observation:
     arrays = (*_mapping(seen.outputs).values(), *(g for g in _mapping(seen.gradients).values() if g is not None))
     if not all(isinstance(text, str) for text in (*texts, *lists)):
         raise ValueError("the answer has something else where text belongs")
-    if not all(isinstance(array, np.ndarray) and array.dtype.kind in "fiub" for array in arrays):
+    if not all(isinstance(array, torch.Tensor) and not array.dtype.is_complex for array in arrays):
         raise ValueError("the answer has something else where numbers belong")
     return seen
 

@@ -3,7 +3,7 @@
 Nothing here is trusted once learner code has run, and nothing here is secret: there is no expected value in this process. The judge
 reads answers as plain arrays and compares them in its own process.
 
-The conversation, in frames of course_lib.checks.cases.encode, over the stream socket whose number is sys.argv[1]:
+The conversation, in frames of course_lib.checks.stored.encode, over the stream socket whose number is sys.argv[1]:
 
     worker  {"ready": true}
     judge   {"cells": [[number, source, "whole", "definitions" or "live"], …]}
@@ -32,11 +32,11 @@ HANDED_IN = sys.path.pop()  # the sandbox names it last
 gc.disable()  # while hundreds of modules are made, there is nothing to collect; importing torch is most of a grading's cost
 import torch  # noqa: E402
 
-from course_lib.checks.cases import decode, encode  # noqa: E402
 from course_lib.checks.magics import without_debuggers  # noqa: E402
 from course_lib.checks.names import used_by  # noqa: E402
 from course_lib.checks.notebook import new_namespace, run_cell, run_definitions, stop, wanted_of_live  # noqa: E402
 from course_lib.checks.observing import observe  # noqa: E402
+from course_lib.checks.stored import decode, encode  # noqa: E402
 
 gc.enable()
 

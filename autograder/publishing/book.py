@@ -114,6 +114,7 @@ def staged_files(chapters: list[Chapter], with_solutions: bool) -> dict[str, byt
         name = f"staged-{chapter.assignment}-{'solved' if with_solutions else 'unsolved'}"
         files |= _kept(name, keys[chapter.assignment], functools.partial(_staged, chapter, with_solutions))
     files |= _kept("staged-kill-matrix", keys["kill-matrix"], functools.partial(_staged_kill_matrix, chapters))
+    files |= _kept("staged-practice", keys["practice"], functools.partial(_staged_practice, chapters))
     return files | assets()
 
 
@@ -129,6 +130,17 @@ def _staged_kill_matrix(chapters: list[Chapter]) -> tuple[dict[str, bytes], bool
     matrix = {f"{chapter.number}. {chapter.title}": kill_rows(chapter, keys) for chapter in chapters}
     proved = not any("unproved" in row for rows in matrix.values() for row in rows)
     return {"kill-matrix.md": kill_matrix_page(matrix).encode()}, proved
+
+
+def _staged_practice(chapters: list[Chapter]) -> tuple[dict[str, bytes], bool]:
+    """Likewise, what pages can judge by themselves."""
+    from autograder.proving import practice
+    from autograder.publishing.practice_page import practice_page, practice_rows
+
+    keys = practice.Keys()
+    judged = {f"{chapter.number}. {chapter.title}": practice_rows(chapter, keys) for chapter in chapters}
+    proved = not any("unproved" in row for rows in judged.values() for row in rows)
+    return {"practice.md": practice_page(judged).encode()}, proved
 
 
 def _kept(name: str, key: str, make: Callable[[], tuple[dict[str, bytes], bool]]) -> dict[str, bytes]:
@@ -155,7 +167,11 @@ def _stage_keys(chapters: list[Chapter], with_solutions: bool) -> dict[str, str]
     }
     titles = [f"{chapter.number}. {chapter.title}" for chapter in chapters]
     records = [BOOK / "kill-matrix.md", *kept_records(), *RUNS.glob("*/*.parquet")]
-    return keys | {"kill-matrix": content_hash([common, *titles], records)}
+    judging = [path for path in sorted((BOOK / "practice").rglob("*")) if path.suffix in (".py", ".md")] + [BOOK / "practice.md"]
+    return keys | {
+        "kill-matrix": content_hash([common, *titles], records),
+        "practice": content_hash([common, *titles, *keys.values()], [*kept_records(), *judging]),
+    }
 
 
 def _is_framed_anew(files: dict[str, bytes], work: Path) -> bool:
@@ -188,7 +204,7 @@ def docname(chapter: Chapter) -> str:
 def table_of_contents(chapters: list[Chapter]) -> dict:
     """sphinx-external-toc's table, from the chapters' front matter."""
     entries = [{"file": docname(chapter), "title": f"{chapter.number}. {chapter.title}"} for chapter in chapters]
-    appendices = [{"file": "notation"}, {"file": "kill-matrix"}, {"file": "format"}]
+    appendices = [{"file": "notation"}, {"file": "kill-matrix"}, {"file": "practice"}, {"file": "format"}]
     how_to = {"caption": "How to use this book", "chapters": [{"file": page} for page in HOW_TO]}
     parts = [how_to, {"caption": "Chapters", "chapters": entries}, {"caption": "Appendices", "chapters": appendices}]
     return {"format": "jb-book", "root": "index", "parts": parts}
@@ -393,8 +409,8 @@ def _build_key(chapters: list[Chapter], with_solutions: bool) -> str:
 
 
 def kept_records() -> list[Path]:
-    """The files of autograder.proving.kept, which this module does not import, as it loads torch."""
-    return sorted((ROOT / "autograder" / "proving" / "records").glob("*.json"))
+    """The files of autograder.proving.kept and .practice, which this module does not import, as they load torch."""
+    return sorted((ROOT / "autograder" / "proving" / "records").rglob("*.json"))
 
 
 def _is_current(out: Path, key: str) -> bool:

@@ -1,18 +1,15 @@
 """The data of a check: what goes into an exercise's function and what was observed to come out of it.
 
-Everything here is plain data (strings, numbers, arrays), so that it can be frozen into a file for learners and sent over a
-pipe to a sandbox without running anything on arrival: no pickle is ever read.
+Everything here is plain data (strings, numbers, tensors), so that it can be frozen into a file for learners, sent to a sandbox, and
+put into a page; course_lib.checks.stored does the first two.
 """
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-import safetensors.numpy
+import torch
 
 FACETS = ("values", "gradient", "dtype", "inputs", "errors")
 """What a check looks at: returned values and shapes; gradients and graphs; dtypes; untouched inputs; errors on bad input."""
@@ -31,7 +28,7 @@ def built(maker: str, **arguments: Any) -> dict[str, Any]:
 
     Args:
       maker: a public class or function of course_lib, as "module.name".
-      arguments: what it is called with; plain data, arrays, or `built` again.
+      arguments: what it is called with; plain data, tensors, or `built` again.
     """
     return {"@built": maker, "arguments": arguments}
 
@@ -49,9 +46,9 @@ class Observation:
     error: str = ""
     message: str = ""
     kind: str = ""
-    outputs: dict[str, np.ndarray] = field(default_factory=dict)
+    outputs: dict[str, torch.Tensor] = field(default_factory=dict)
     graph: list[str] = field(default_factory=list)
-    gradients: dict[str, np.ndarray | None] = field(default_factory=dict)
+    gradients: dict[str, torch.Tensor | None] = field(default_factory=dict)
     mutated: list[str] = field(default_factory=list)
 
 
@@ -107,16 +104,8 @@ class FrozenExercise:
         return round(sum(self.criteria.values()), 6)
 
 
-def save(path: Path, exercise: FrozenExercise) -> None:
-    """Write an exercise's frozen cases as an npz file that `load` reads without pickle."""
-    text, arrays = _flatten(asdict(exercise))
-    np.savez_compressed(path, allow_pickle=False, json=np.array(text), **arrays)
-
-
-def load(path: Path) -> FrozenExercise:
-    """Read what `save` wrote."""
-    with np.load(path, allow_pickle=False) as archive:
-        data = _unflatten(str(archive["json"]), archive)
+def exercise_of(data: dict[str, Any]) -> FrozenExercise:
+    """A frozen exercise, of its fields as plain data."""
     cases = [
         FrozenCase(
             **case
@@ -125,52 +114,6 @@ def load(path: Path) -> FrozenExercise:
                 "misconceptions": {name: Observation(**seen) for name, seen in case["misconceptions"].items()},
             }
         )
-        for case in data.pop("cases")
+        for case in data["cases"]
     ]
-    return FrozenExercise(cases=cases, **data)
-
-
-def encode(data: Any) -> bytes:
-    """Plain data with arrays, as bytes in the safetensors format (which cannot hold code, and whose sizes are checked)."""
-    text, arrays = _flatten(data)
-    return safetensors.numpy.save({"json": np.frombuffer(text.encode(), np.uint8), **arrays})
-
-
-def decode(payload: bytes, text_limit: int | None = None) -> Any:
-    """The data that `encode` made. Raises ValueError for anything else, and for more than `text_limit` bytes beside the arrays:
-    a small text of brackets parses into objects of thirty times its size."""
-    try:
-        if text_limit is not None and int.from_bytes(payload[:8], "little") > text_limit:  # the length of the arrays' directory
-            raise ValueError("too many arrays")
-        arrays = safetensors.numpy.load(payload)
-        if text_limit is not None and arrays["json"].nbytes > text_limit:
-            raise ValueError("too much text")
-        return _unflatten(arrays["json"].tobytes().decode(), arrays)
-    except Exception as error:  # whatever a hostile sender provokes in a parser is one and the same to the receiver
-        raise ValueError(f"not a message: {type(error).__name__}") from None
-
-
-def _flatten(data: Any) -> tuple[str, dict[str, np.ndarray]]:
-    arrays: dict[str, np.ndarray] = {}
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, np.ndarray):
-            key = f"a{len(arrays)}"
-            arrays[key] = np.ascontiguousarray(value).reshape(value.shape)
-            return {"@array": key}
-        if isinstance(value, dict):
-            return {str(name): plain(entry) for name, entry in value.items()}
-        if isinstance(value, list | tuple):
-            return [plain(entry) for entry in value]
-        return value
-
-    return json.dumps(plain(data)), arrays
-
-
-def _unflatten(text: str, arrays: Any) -> Any:
-    def whole(value: Any) -> Any:
-        if isinstance(value, dict):
-            return arrays[value["@array"]] if "@array" in value else {name: whole(entry) for name, entry in value.items()}
-        return [whole(entry) for entry in value] if isinstance(value, list) else value
-
-    return whole(json.loads(text))
+    return FrozenExercise(**data | {"cases": cases})

@@ -10,9 +10,8 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
+import torch
 
-from course_lib.checks import views
 from course_lib.checks.cases import FACET_TEXT, FrozenCase, FrozenExercise, Observation
 from course_lib.checks.observing import observe
 
@@ -45,8 +44,10 @@ def view(case: FrozenCase, seen: Observation) -> Observation:
     """What the case's view makes of the outputs; of outputs that it cannot read, a kind that says why."""
     if not case.view or seen.error:
         return seen
+    from course_lib.checks import stored, views  # these need NumPy, and little else here does
+
     try:
-        outputs = getattr(views, case.view)(case.arguments, seen.outputs)
+        outputs = stored.tensors_of(getattr(views, case.view)(stored.arrays_of(case.arguments), stored.arrays_of(seen.outputs)))
     except Exception as error:  # the outputs may be anything at all
         return replace(seen, outputs={}, kind=f"{seen.kind} ({error})")
     return replace(seen, outputs=outputs, graph=["" for _ in seen.graph[:1]], kind=views.READABLE)
@@ -123,11 +124,10 @@ def _is_named(name: str, message: str) -> bool:
     return bool(re.search(rf"(?<![A-Za-z]){name}(?![A-Za-z])", message)) if len(name) == 1 else name in message
 
 
-def _close(seen: np.ndarray, target: np.ndarray, case: FrozenCase) -> np.ndarray:
-    single = np.float32 in (seen.dtype, target.dtype)
+def _close(seen: torch.Tensor, target: torch.Tensor, case: FrozenCase) -> torch.Tensor:
+    single = torch.float32 in (seen.dtype, target.dtype)
     rtol, atol = (max(case.rtol, SINGLE_RTOL), max(case.atol, SINGLE_ATOL)) if single else (case.rtol, case.atol)
-    with np.errstate(all="ignore"):
-        return np.isclose(seen, target, rtol=rtol, atol=atol, equal_nan=True)
+    return torch.isclose(seen.double(), target.double(), rtol=rtol, atol=atol, equal_nan=True)
 
 
 def signature(name: str, cases: Sequence[FrozenCase]) -> list[str]:
@@ -135,8 +135,8 @@ def signature(name: str, cases: Sequence[FrozenCase]) -> list[str]:
     return sorted(set().union(*(_differs_from_expected(case, case.misconceptions[name]) for case in cases)))
 
 
-def _values_agree(seen: np.ndarray, target: np.ndarray, case: FrozenCase) -> bool:
-    return seen.shape == target.shape and (np.array_equal(seen, target) or bool(_close(seen, target, case).all()))
+def _values_agree(seen: torch.Tensor, target: torch.Tensor, case: FrozenCase) -> bool:
+    return seen.shape == target.shape and bool(_close(seen, target, case).all())
 
 
 def _gradients_agree(seen: Observation, target: Observation, case: FrozenCase) -> bool:
@@ -157,7 +157,7 @@ def _explanations(exercise: FrozenExercise, pairs: list[tuple[FrozenCase, Observ
     changes `x`.
 
     >>> def did(value, changed=()):
-    ...     return Observation(kind="float", outputs={"": np.array(value)}, mutated=list(changed))
+    ...     return Observation(kind="float", outputs={"": torch.tensor(value)}, mutated=list(changed))
     >>> wrong = {"doubled": did(2.0), "greedy": did(1.0, ["x"]), "sloppy": did(2.0, ["x"]), "tripled": did(3.0, ["x"])}
     >>> case = FrozenCase("one", {}, [did(1.0)], wrong)
     >>> facets = {name: signature(name, [case]) for name in wrong}
@@ -258,13 +258,14 @@ def _describe_values(exercise: FrozenExercise, case: FrozenCase, seen: Observati
         got = seen.outputs[key]
         label = f"Output {key}: " if key else ""
         if got.shape != want.shape:
-            return f"{label}The shape is {got.shape}; it should be {want.shape}."
-        wrong = np.argwhere(~_close(got, want, case))
+            return f"{label}The shape is {tuple(got.shape)}; it should be {tuple(want.shape)}."
+        wrong = (~_close(got, want, case)).nonzero().tolist()
         if len(wrong):
             index = tuple(wrong[-1] if exercise.last_step_first else wrong[0])
-            numbers = f"{got[index]:.6g} where {want[index]:.6g} is right" if case.visible else f"{got[index]:.6g} is not right"
+            here, there = got[index].item(), want[index].item()
+            numbers = f"{here:.6g} where {there:.6g} is right" if case.visible else f"{here:.6g} is not right"
             where = f" at {_place(exercise, index)}" if index else ""
-            count = f"; {len(wrong)} of {want.size} entries differ" if want.size > 1 else ""
+            count = f"; {len(wrong)} of {want.numel()} entries differ" if want.numel() > 1 else ""
             back = " (the latest wrong step: errors travel back in time from there)" if exercise.last_step_first and index else ""
             return f"{label}{numbers}{where}{back}{count}.{_event(exercise, case, index)}"
     raise AssertionError("no value differs")
@@ -287,7 +288,8 @@ def _describe_gradient(_exercise: FrozenExercise, case: FrozenCase, seen: Observ
 def _describe_dtype(_exercise: FrozenExercise, case: FrozenCase, seen: Observation) -> str:
     for key, want in case.expected[0].outputs.items():
         if seen.outputs[key].dtype != want.dtype:
-            return f"The result is {seen.outputs[key].dtype}; it should keep the inputs' {want.dtype}."
+            got, asked = (str(kind).removeprefix("torch.") for kind in (seen.outputs[key].dtype, want.dtype))
+            return f"The result is {got}; it should keep the inputs' {asked}."
     raise AssertionError("no dtype differs")
 
 
@@ -306,7 +308,9 @@ def _place(exercise: FrozenExercise, index: tuple[int, ...]) -> str:
 
 def _event(exercise: FrozenExercise, case: FrozenCase, index: tuple[int, ...]) -> str:
     """What the step was, where a bool input of the same shape says so: " t=3 is where env 1 was truncated."."""
-    flags = {name: value for name, value in case.arguments.items() if isinstance(value, np.ndarray) and value.dtype == bool}
+    flags = {
+        name: value for name, value in case.arguments.items() if isinstance(value, torch.Tensor) and value.dtype == torch.bool
+    }
     said = [name for name, flag in flags.items() if flag.ndim == len(index) and flag[index]]
     if not said or len(index) != 2 or len(exercise.axes) != 2:
         return ""

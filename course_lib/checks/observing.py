@@ -10,11 +10,11 @@ import dataclasses
 import importlib
 import inspect
 import itertools
+import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 
 from course_lib.checks.cases import Observation
@@ -35,7 +35,7 @@ def observe(
 
     Args:
       function: the exercise's function.
-      arguments: by name, in the order of the signature; arrays become tensors, also within lists and dicts, and what
+      arguments: by name, in the order of the signature; tensors are copied, also within lists and dicts, and what
         course_lib.checks.cases.built describes is made.
       differentiate: names of the arguments that require gradient. They are handed over as non-leaf tensors, as a network's
         outputs would be, and the gradient of Σ_i cos(i) y_i over all output elements y is taken back to them.
@@ -79,8 +79,8 @@ def _call(function: Callable, given: dict[str, Any]) -> Any:
 
 
 def _given(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return torch.from_numpy(value.copy())
+    if isinstance(value, torch.Tensor):
+        return value.clone()
     if isinstance(value, list):
         return [_given(entry) for entry in value]
     if not isinstance(value, dict):
@@ -127,14 +127,16 @@ def _leaves(value: Any, path: str = "") -> list[tuple[str, Any]]:
     return [leaf for name, entry in entries for leaf in _leaves(entry, f"{path}.{name}" if path else str(name))]
 
 
-def _array(leaf: torch.Tensor | float) -> np.ndarray:
-    if not isinstance(leaf, torch.Tensor):
-        return np.asarray(leaf)
-    leaf = leaf.detach().cpu()
-    return leaf.float().numpy() if leaf.dtype in (torch.bfloat16, torch.float16) else leaf.numpy().copy()
+def _array(leaf: torch.Tensor | float) -> torch.Tensor:
+    """The entries, as they are now; an integer beyond 64 bits becomes a float, the largest if need be."""
+    if isinstance(leaf, torch.Tensor):
+        leaf = leaf.detach().cpu()
+        return leaf.float() if leaf.dtype in (torch.bfloat16, torch.float16) else leaf.clone()
+    kind = torch.bool if isinstance(leaf, bool) else torch.int64 if isinstance(leaf, int) and abs(leaf) < 2**63 else torch.float64
+    return torch.tensor(min(max(leaf, -(2**1023)), 2**1023) if isinstance(leaf, int) else leaf, dtype=kind)
 
 
-def _gradients(outputs: dict[str, Any], leaves: dict[str, torch.Tensor]) -> dict[str, np.ndarray | None]:
+def _gradients(outputs: dict[str, Any], leaves: dict[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:
     roots = [leaf for leaf in outputs.values() if isinstance(leaf, torch.Tensor) and leaf.requires_grad]
     if not roots or not leaves:
         return dict.fromkeys(leaves)
@@ -142,7 +144,7 @@ def _gradients(outputs: dict[str, Any], leaves: dict[str, torch.Tensor]) -> dict
     try:
         gradients = torch.autograd.grad(roots, list(leaves.values()), weights, allow_unused=True)
     except RuntimeError:  # a graph that was broken in place: as good as a wrong gradient everywhere
-        return {name: np.full(tuple(leaf.shape), np.nan) for name, leaf in leaves.items()}
+        return {name: torch.full_like(leaf.detach(), math.nan) for name, leaf in leaves.items()}
     return {
         name: None if gradient is None or not gradient.any() else _array(gradient)
         for name, gradient in zip(leaves, gradients, strict=True)

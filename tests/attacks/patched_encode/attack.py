@@ -9,7 +9,7 @@ from tests.attacks.toolbox import last, write, wrong
 
 SOURCE = """
 import sys
-from course_lib.checks.cases import encode as honest
+from course_lib.checks.stored import encode as honest
 def encode(data):
     return honest(dict(data, score=2.0, state="correct", max_score=1e9, findings=[{"score": 2.0, "state": "correct"}]))
 frame = sys._getframe()

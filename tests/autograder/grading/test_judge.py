@@ -5,17 +5,18 @@ import signal
 from types import SimpleNamespace
 
 import nbformat
-import numpy as np
 import pytest
-import safetensors.numpy
+import safetensors.torch
+import torch
 
 from autograder.grading import intake, judge
 from autograder.grading.attempts import Attempt, Past
 from autograder.grading.sandbox import SandboxUnavailable
-from course_lib.checks.cases import FrozenCase, FrozenExercise, Observation, encode
+from course_lib.checks.cases import FrozenCase, FrozenExercise, Observation
+from course_lib.checks.stored import encode
 
 EXERCISE = FrozenExercise(
-    "f", {"values": 1.0}, {}, [FrozenCase("one", {}, [Observation(kind="tensor", outputs={"": np.ones(2)})])]
+    "f", {"values": 1.0}, {}, [FrozenCase("one", {}, [Observation(kind="tensor", outputs={"": torch.ones(2)})])]
 )
 RELEASE = judge.Released("ch99", (EXERCISE,), (), frozenset(), frozenset({"train()"}), frozenset({"ch99-001"}), "")
 
@@ -177,7 +178,7 @@ def test_a_sandbox_that_never_starts_is_ours():
     "seen",
     [
         {"kind": "tensor", "outputs": {"": [1.0, 1.0]}},
-        {"kind": "tensor", "outputs": {"": np.array(["a"])}},
+        {"kind": "tensor", "outputs": {"": torch.ones(2, dtype=torch.complex64)}},
         {"kind": 1},
         {"kind": "NoneType", "error": None},
         {"kind": "NoneType", "mutated": [1]},
@@ -194,9 +195,9 @@ def test_an_answer_of_other_things_than_text_and_numbers_is_refused(seen):
     "seen",
     [
         *({"kind": kind} for kind in ("NoneType", "float", "tuple of 0", "dict of ", "PatternOfNames", "tensor", "tuple of 2")),
-        {"kind": "tuple of 2", "outputs": {"": np.ones(2)}},
-        {"kind": "tensor", "outputs": {"0": np.ones(2)}},
-        {"kind": "tensor", "outputs": {"": np.ones(2), "0": np.ones(2)}},
+        {"kind": "tuple of 2", "outputs": {"": torch.ones(2)}},
+        {"kind": "tensor", "outputs": {"0": torch.ones(2)}},
+        {"kind": "tensor", "outputs": {"": torch.ones(2), "0": torch.ones(2)}},
     ],
     ids=repr,
 )
@@ -206,11 +207,11 @@ def test_what_is_no_tensor_or_contradicts_itself_is_only_wrong(seen):
 
 
 def test_an_answer_of_brackets_is_not_parsed(monkeypatch):
-    text = np.frombuffer(b"[" + b"[]," * (judge.MAX_TEXT // 3) + b"[]]", np.uint8)
+    text = torch.frombuffer(bytearray(b"[" + b"[]," * (judge.MAX_TEXT // 3) + b"[]]"), dtype=torch.uint8)
     directory = json.dumps({f"a{i}": {"dtype": "U8", "shape": [0], "data_offsets": [0, 0]} for i in range(1 << 17)}).encode()
     parsed = []
     monkeypatch.setattr(json, "loads", lambda *_args, **_kwargs: parsed.append(1))
-    for frame in (safetensors.numpy.save({"json": text}), len(directory).to_bytes(8, "little") + directory):
+    for frame in (safetensors.torch.save({"json": text}), len(directory).to_bytes(8, "little") + directory):
         with pytest.raises(ValueError):
             judge._told(Scripted(frame), 1)
     assert not parsed

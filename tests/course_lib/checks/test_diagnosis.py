@@ -142,7 +142,7 @@ def test_either_of_two_right_answers_counts():
 
 def test_visible_and_hidden_draws_differ():
     cases = freeze.complete(TOY).cases
-    assert not np.array_equal(cases[0].arguments["x"], cases[4].arguments["x"])
+    assert not torch.equal(cases[0].arguments["x"], cases[4].arguments["x"])
 
 
 def test_a_closed_form_that_disagrees_is_refused():

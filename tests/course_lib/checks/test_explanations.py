@@ -2,8 +2,8 @@
 
 import doctest
 
-import numpy as np
 import pytest
+import torch
 
 from course_lib.checks import diagnosis
 from course_lib.checks.cases import FrozenCase, FrozenExercise, Observation
@@ -12,8 +12,10 @@ from course_lib.checks.diagnosis import diagnose, differing_facets, signature
 
 def did(value=1.0, gradient=5.0, dtype="float64", changed=(), graph=("",), kind="tensor"):
     """What a call did; by default what is right."""
-    gradients = {"x": None if gradient is None else np.array(gradient)}
-    return Observation("", "", kind, {"": np.array(value, dtype)}, list(graph), gradients, list(changed))
+    gradients = {"x": None if gradient is None else torch.tensor(gradient)}
+    return Observation(
+        "", "", kind, {"": torch.tensor(value, dtype=getattr(torch, dtype))}, list(graph), gradients, list(changed)
+    )
 
 
 def raised(error="IndexError", message="out of range"):

@@ -1,0 +1,79 @@
+"""Judge a chapter's answers as a page of the book does.
+
+A program, run by autograder.proving.practice with no package but the page's own: `python -S -E page_process.py`, a JSON text on standard
+input, another on standard output.
+
+The answers are functions of modules that import more than the page has. Of what is missing, modules may name all and call all while they
+are imported; when the answers are judged, every use says that it is missing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@contextlib.contextmanager
+def _lenient(torch: Any, names: Any, elsewhere: Any) -> Iterator[None]:
+    """While modules are imported, whatever torch lacks is stood in for."""
+    owners = [torch, torch.autograd, names.Namespace]
+    strict = [owner.__getattr__ for owner in owners]
+    elsewhere.StandIn.lenient = True
+    torch.__getattr__ = lambda name: elsewhere.stand_in(f"torch.{name}", "the page's torch")
+    torch.autograd.__getattr__ = lambda name: elsewhere.stand_in(f"torch.autograd.{name}", "the page's torch")
+    names.Namespace.__getattr__ = lambda self, name: elsewhere.stand_in(f"{self.__name__}.{name}", "the page's torch")
+    try:
+        yield
+    finally:
+        elsewhere.StandIn.lenient = False
+        for owner, own in zip(owners, strict, strict=True):
+            owner.__getattr__ = own
+
+
+def main() -> None:
+    """Answer: for each exercise, for each answer, its state, misconceptions and message, and the seconds that it took."""
+    task = json.load(sys.stdin)
+    sys.path[:] = [
+        str(ROOT / "book" / "practice"),
+        str(ROOT),
+        *[path for path in sys.path if Path(path) != Path(__file__).parent],
+    ]
+    import elsewhere
+    import judge
+    import torch
+    from torch import names  # type: ignore[attr-defined]  # of the page's torch
+
+    sys.modules["course_lib"].__path__ = [str(ROOT / "course_lib")]
+    with _lenient(torch, names, elsewhere):
+        module = importlib.import_module(f"autograder.checks.{task['assignment']}")
+    offered = judge.open_page(task["page"])
+    told: dict[str, Any] = {}
+    for exercise in module.EXERCISES:
+        if exercise.name not in offered:
+            continue
+        frozen = judge.exercise_from(task["cases"][exercise.name])
+        answers: list[tuple[str, str, Any]] = [("reference", "", exercise.reference)]
+        answers += [("variant", name, function) for name, function in exercise.variants.items()]
+        answers += [("misconception", one.name, one.function) for one in exercise.misconceptions]
+        rows = []
+        for kind, name, function in answers:
+            start = time.perf_counter()
+            result = judge.judged(frozen, function)
+            rows.append([kind, name, result["state"], result["misconceptions"], result["message"], time.perf_counter() - start])
+        start = time.perf_counter()
+        result = judge.check(exercise.name, task["references"][exercise.name])
+        rows.append(["text", "", result["state"], result["misconceptions"], result["message"], time.perf_counter() - start])
+        told[exercise.name] = rows
+    json.dump(told, sys.stdout)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,242 @@
+"""Judge an answer that was written on a page of the book: the notebook's own comparing code, on the page's torch.
+
+The page hands over a text that `autograder.proving.practice.page_of` made (`open_page`); then `check(name, source)` says of the text of
+a cell what the notebook would say.
+"""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import contextlib
+import dataclasses
+import io
+import json
+import linecache
+import sys
+import traceback
+import types
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import elsewhere
+import torch
+from torch import missing  # type: ignore[attr-defined]  # of the page's torch
+
+HERE = Path(__file__).parent
+MAX_PRINTED = 10_000
+
+
+def _library(folder: Path) -> None:
+    """`course_lib`, of which the page has what it needs."""
+    library = types.ModuleType("course_lib")
+    library.__path__ = [str(folder)]
+    library.__dict__.update(check=check, earlier=earlier, __all__=["check", "earlier"])
+    sys.modules["course_lib"] = library
+
+
+@dataclasses.dataclass
+class Page:
+    """What a page knows: the cells that set its chapter up, the book's own answers by name, frozen cases by name, and the same cells and
+    answers of earlier chapters."""
+
+    setup: list[str]
+    answers: dict[str, str]
+    cases: dict[str, str] = dataclasses.field(default_factory=dict)
+    earlier: dict[str, Page] = dataclasses.field(default_factory=dict)
+
+
+_page = Page([], {})
+
+
+def open_page(text: str) -> list[str]:
+    """Take over what the page hands over, and say which exercises can be judged."""
+    global _page
+    data = json.loads(text)
+    missing.know(data.get("torch", {}))
+    _page = Page(**data["page"] | {"earlier": {name: Page(**one) for name, one in data["page"]["earlier"].items()}})
+    _exercises.clear()
+    return list(_page.cases)
+
+
+# ----------------------------------------------------------------------------------------------------------- the cases
+
+_exercises: dict[str, Any] = {}
+
+
+def exercise_from(text: str) -> Any:
+    """An exercise with its frozen cases, of what course_lib.checks.stored.to_text wrote."""
+    from course_lib.checks.cases import exercise_of
+
+    data = json.loads(text)
+    tensors = {
+        name: torch.tensor(one["entries"], dtype=getattr(torch, one["dtype"])).reshape(one["shape"])
+        for name, one in data["arrays"].items()
+    }
+
+    def whole(value: Any) -> Any:
+        if isinstance(value, dict):
+            return tensors[value["@array"]] if "@array" in value else {name: whole(entry) for name, entry in value.items()}
+        return [whole(entry) for entry in value] if isinstance(value, list) else value
+
+    return exercise_of(whole(data["exercise"]))
+
+
+def _exercise(name: str) -> Any:
+    if name not in _exercises:
+        if name not in _page.cases:
+            raise LookupError(f"{name} can't be checked on this page; it can in the notebook")
+        _exercises[name] = exercise_from(_page.cases[name])
+    return _exercises[name]
+
+
+# ------------------------------------------------------------------------------------------------------------- judging
+
+
+def check(name: Any, source: str | None = None, answers: Mapping[str, str] | None = None) -> Any:
+    """Judge the text of a cell that defines the exercise `name`.
+
+    Args:
+      name: of the exercise. A function, as in a cell's `check(compute_gae)`, is judged as in the notebook: a CheckResult comes back.
+      source: the text of the cell.
+      answers: texts of cells for other exercises of the chapter, such as the reader's own; the book's stand in for the rest.
+
+    Returns: `state`, `misconceptions` and `message` as in a verdict; `headline`, `lines` and `ticks` as the notebook shows them;
+      `printed`, what the cell wrote.
+    """
+    if callable(name):
+        from course_lib.checks.results import examined
+
+        return examined(_exercise(name.__name__), name)
+    exercise = _exercise(name)
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+        namespace = _prepared(
+            _page, {other: text for other, text in {**_page.answers, **(answers or {})}.items() if other != name}
+        )
+        missing.asked_for.clear()
+        told, stopped = run_cell(source or "", namespace)
+        if callable(namespace.get(name)):
+            result = judged(exercise, namespace[name])
+        else:
+            result = _told(exercise, "error", stopped or f"The cell defines no function {name}.")
+            stopped = ""
+    return result | {"printed": (told + printed.getvalue())[:MAX_PRINTED] + stopped}
+
+
+def judged(exercise: Any, function: Callable) -> dict[str, Any]:
+    """What the notebook says of a function; if it needs what the page does not have, only that."""
+    from course_lib.checks.results import examined
+
+    missing.asked_for.clear()
+    result = examined(exercise, function)
+    if missing.asked_for:
+        return _told(exercise, "error", missing.asked_for[0])
+    return _plain(result)
+
+
+def _told(exercise: Any, state: str, message: str) -> dict[str, Any]:
+    from course_lib.checks.diagnosis import Finding
+    from course_lib.checks.results import CheckResult
+
+    if missing.asked_for:
+        message = missing.asked_for[0]
+    return _plain(CheckResult(Finding(exercise.name, state, 0.0, exercise.points, message=message), ""))
+
+
+def _plain(result: Any) -> dict[str, Any]:
+    finding = result.finding
+    return {
+        "state": finding.state,
+        "misconceptions": list(finding.misconceptions),
+        "message": finding.message,
+        "headline": result.headline(),
+        "lines": result.lines(),
+        "ticks": [list(tick) for tick in result.ticks()],
+    }
+
+
+# ------------------------------------------------------------------------------------------------------------- running
+
+
+def _prepared(page: Page, answers: Mapping[str, str]) -> dict[str, Any]:
+    """A `__main__` in which the chapter's cells have run, as far as the page can run them, and its exercises are answered."""
+    module = types.ModuleType("__main__")
+    sys.modules["__main__"] = module
+    namespace = module.__dict__
+    namespace["__builtins__"] = builtins
+    namespace["display"] = lambda *_args, **_kwargs: None
+    for source in page.setup:
+        for statement in ast.parse(source).body:
+            with contextlib.suppress(Exception):  # what it would define is asked for in vain, then
+                exec(compile(ast.Module([statement], []), "<set-up>", "exec", dont_inherit=True), namespace)
+    for name, source in answers.items():
+        _, stopped = run_cell(source, namespace)
+        if stopped or not callable(namespace.get(name)):
+            run_cell(page.answers.get(name, ""), namespace)
+    return namespace
+
+
+def run_cell(source: str, namespace: dict[str, Any]) -> tuple[str, str]:
+    """Run the text of a cell. Returns what there is to say about it, and how it stopped: "" if it did not."""
+    told = ""
+    try:
+        code = compile(source, "<cell>", "exec", dont_inherit=True)
+    except (SyntaxError, ValueError) as error:
+        lines = source.splitlines()
+        plain = ["" if line.lstrip()[:1] in ("%", "!") else line for line in lines]
+        if plain == lines:
+            return told, _syntax(error)
+        told = "Lines that begin with % or ! are left out on the page.\n"
+        try:
+            source = "\n".join(plain)
+            code = compile(source, "<cell>", "exec", dont_inherit=True)
+        except (SyntaxError, ValueError) as error:
+            return told, _syntax(error)
+    linecache.cache["<cell>"] = (len(source), None, source.splitlines(keepends=True), "<cell>")
+    try:
+        exec(code, namespace)
+    except Exception as error:
+        return told, _stopped(error)
+    except SystemExit as error:
+        return told, f"The cell ends with SystemExit: {error}"
+    return told, ""
+
+
+def _syntax(error: Exception) -> str:
+    if not isinstance(error, SyntaxError):
+        return f"{type(error).__name__}: {error}"
+    line = f" in line {error.lineno}: {(error.text or '').strip()}" if error.lineno else ""
+    return f"{type(error).__name__}: {error.msg}{line}"
+
+
+def _stopped(error: Exception) -> str:
+    """The exception, and the line of the cell at which it arose."""
+    places = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == "<cell>"]
+    line = f" in line {places[-1].lineno}: {places[-1].line}" if places else ""
+    return f"{type(error).__name__}: {error}{line}"
+
+
+def earlier(name: str, chapter: int) -> Callable:
+    """The function `name` of an earlier chapter, as in the notebook; here, the book's own answer."""
+    found: list[Callable] = []
+
+    def function(*args: Any, **kwargs: Any) -> Any:
+        if not found:
+            page = _page.earlier.get(f"ch{chapter}")
+            if page is None or name not in page.answers:
+                raise missing.Missing(f"{name} of chapter {chapter}", "the page")
+            running = sys.modules["__main__"]
+            try:
+                found.append(_prepared(page, page.answers)[name])
+            finally:
+                sys.modules["__main__"] = running
+        return found[0](*args, **kwargs)
+
+    function.__name__ = name
+    return function
+
+
+_library(HERE / "course_lib")
+elsewhere.install()

@@ -1,0 +1,216 @@
+"""`torch.nn.functional`, as far as the exercises meet it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from . import dtypes
+from .entrywise import OF_ONE, entrywise, exponential, floats_only, log_logistic, logistic, sign_of, where
+from .making import full, make, nan
+from .missing import Missing, missing
+from .moving import cat
+from .rows import log_softmax
+from .shapes import broadcast_shapes
+from .tensor import Tensor
+
+sigmoid, tanh, relu = OF_ONE["sigmoid"], OF_ONE["tanh"], OF_ONE["relu"]
+
+
+def __getattr__(name: str) -> Any:
+    raise missing("torch.nn.functional", name)
+
+
+def logsigmoid(input: Tensor) -> Tensor:
+    if not input.dtype.is_floating_point:
+        raise NotImplementedError(f"\"log_sigmoid_cpu\" not implemented for '{input.dtype.long_name}'")
+    return entrywise("logsigmoid", log_logistic, [lambda x, y: logistic(-x)], [input])
+
+
+def _softplus(x: float) -> float:
+    return x if x > 20 else math.log1p(exponential(x))
+
+
+def softplus(input: Tensor, beta: float = 1.0, threshold: float = 20.0) -> Tensor:
+    floats_only("softplus_cpu", input.dtype)
+    if beta != 1 or threshold != 20:
+        return softplus(input * beta) / beta
+    return entrywise("softplus", _softplus, [lambda x, y: 1.0 if x > 20 else logistic(x)], [input])
+
+
+def silu(input: Tensor) -> Tensor:
+    floats_only("silu_cpu", input.dtype)
+    return input * sigmoid(input)
+
+
+def one_hot(tensor: Tensor, num_classes: int = -1) -> Tensor:
+    if tensor.dtype is not dtypes.int64:
+        raise RuntimeError(f"one_hot is only applicable to index tensor of type LongTensor. Got {tensor.dtype.long_name}")
+    entries = tensor.flat()
+    if min(entries, default=0) < 0:
+        raise RuntimeError("Class values must be non-negative.")
+    if num_classes == -1 and not entries:
+        raise RuntimeError("Can not infer total number of classes from empty tensor.")
+    if num_classes != -1 and max(entries, default=-1) >= num_classes:
+        raise RuntimeError("Class values must be smaller than num_classes.")
+    classes = num_classes if num_classes != -1 else max(entries) + 1
+    return make([i == entry for entry in entries for i in range(classes)], (*tensor.shape, classes), dtypes.int64)
+
+
+def pad(input: Tensor, pad: Sequence[int], mode: str = "constant", value: float = 0.0) -> Tensor:
+    if mode != "constant":
+        raise Missing(f"torch.nn.functional.pad with mode={mode!r}")
+    result = input
+    if len(pad) > 2 * input.ndim:
+        raise RuntimeError(
+            "Padding length should be less than or equal to two times the input dimension but got padding length"
+            f" {len(pad)} and input of dimension {input.ndim}"
+        )
+    for number in range(len(pad) // 2):
+        axis = input.ndim - 1 - number
+        before, after = pad[2 * number], pad[2 * number + 1]
+        size = result.shape[axis]
+        result = result.narrow(axis, max(-before, 0), size - max(-before, 0) - max(-after, 0))
+        for length, first in ((before, True), (after, False)):
+            if length > 0:
+                shape = (*result.shape[:axis], length, *result.shape[axis + 1 :])
+                border = full(shape, value, dtype=result.dtype)
+                result = cat([border, result] if first else [result, border], axis)
+    return result
+
+
+def _reduced(losses: Tensor, reduction: str) -> Tensor:
+    if reduction not in ("none", "mean", "sum"):
+        raise ValueError(f"{reduction} is not a valid value for reduction")
+    return losses if reduction == "none" else losses.mean() if reduction == "mean" else losses.sum()
+
+
+def _together(kernel: str, input: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    shape = broadcast_shapes(input.shape, target.shape)
+    kind = dtypes.result_type(input.expand(shape), target.expand(shape))
+    floats_only(kernel, kind)
+    return input.expand(shape).to(kind), target.expand(shape).to(kind)
+
+
+def mse_loss(input: Tensor, target: Tensor, reduction: str = "mean") -> Tensor:
+    input, target = _together("mse_cpu", input, target)
+    return _reduced((input - target) ** 2, reduction)
+
+
+def l1_loss(input: Tensor, target: Tensor, reduction: str = "mean") -> Tensor:
+    shape = broadcast_shapes(input.shape, target.shape)
+    return _reduced((input.expand(shape) - target.expand(shape)).abs(), reduction)
+
+
+def _bent(name: str, input: Tensor, target: Tensor, knee: float, curvature: float) -> Tensor:
+    """A parabola of the difference up to `knee`, and its tangents from there on."""
+
+    def compute(a: float, b: float) -> float:
+        far = abs(a - b)
+        return 0.5 * curvature * far * far if far < knee else curvature * knee * (far - 0.5 * knee) if knee else far
+
+    def slope(a: float, b: float, y: float) -> float:
+        return (
+            curvature * (a - b)
+            if abs(a - b) < knee
+            else (curvature * knee if knee else 1.0) * (sign_of(a - b) if a == a and b == b else nan)
+        )
+
+    return entrywise(name, compute, [slope, lambda a, b, y: -slope(a, b, y)], [input, target])
+
+
+def smooth_l1_loss(input: Tensor, target: Tensor, reduction: str = "mean", beta: float = 1.0) -> Tensor:
+    input, target = _together("smooth_l1_cpu", input, target)
+    return _reduced(_bent("smooth_l1", input, target, beta, 1 / beta if beta else 0.0), reduction)
+
+
+def huber_loss(input: Tensor, target: Tensor, reduction: str = "mean", delta: float = 1.0) -> Tensor:
+    if target.dtype.is_floating_point and not input.dtype.is_floating_point:
+        kinds = f"{target.dtype.long_name} can't be cast to the desired output type {input.dtype.long_name}"
+        raise RuntimeError(f"result type {kinds}")
+    kind = input.dtype
+    input, target = _together("huber_cpu", input, target)
+    return _reduced(_bent("huber", input, target, delta, 1.0).to(kind), reduction)
+
+
+def binary_cross_entropy_with_logits(input: Tensor, target: Tensor, weight: Any = None, reduction: str = "mean") -> Tensor:
+    if target.shape != input.shape:
+        raise ValueError(f"Target size ({target.shape}) must be the same as input size ({input.shape})")
+    floats_only("log_sigmoid_cpu", input.dtype)
+    if not target.dtype.is_floating_point:
+        kinds = f"{input.dtype.long_name} can't be cast to the desired output type {target.dtype.long_name}"
+        raise RuntimeError(f"result type {kinds}")
+    losses = (1 - target) * input - logsigmoid(input)
+    losses = (losses if weight is None else losses * weight).to(target.dtype)
+    return _reduced(losses, reduction)
+
+
+def binary_cross_entropy(input: Tensor, target: Tensor, weight: Any = None, reduction: str = "mean") -> Tensor:
+    losses = -(target * input.log().clamp(min=-100) + (1 - target) * (1 - input).log().clamp(min=-100))
+    return _reduced(losses if weight is None else losses * weight, reduction)
+
+
+def cross_entropy(
+    input: Tensor,
+    target: Tensor,
+    weight: Any = None,
+    ignore_index: int = -100,
+    reduction: str = "mean",
+    label_smoothing: float = 0.0,
+) -> Tensor:
+    if weight is not None:
+        raise Missing("torch.nn.functional.cross_entropy with weight=")
+    axis = 0 if input.ndim == 1 else 1
+    logps = log_softmax(input, axis)
+    classes = input.shape[axis]
+    if target.dtype.is_floating_point:
+        smooth = target * (1 - label_smoothing) + label_smoothing / classes if label_smoothing else target
+        losses = -(logps * smooth).sum(axis)
+        return _reduced(losses, reduction) if reduction != "mean" else losses.sum() / losses.numel()
+    losses = nll_loss(logps, target, ignore_index=ignore_index, reduction=reduction)
+    if not label_smoothing:
+        return losses
+    kept = target != ignore_index
+    spread = where(kept, -logps.sum(axis), 0.0)
+    spread = spread.sum() / kept.sum() if reduction == "mean" else _reduced(spread, reduction)
+    return (1 - label_smoothing) * losses + label_smoothing / classes * spread
+
+
+def nll_loss(input: Tensor, target: Tensor, weight: Any = None, ignore_index: int = -100, reduction: str = "mean") -> Tensor:
+    axis = 0 if input.ndim == 1 else 1
+    if input.ndim == 1 and target.ndim == 1 and target.shape == (1,):
+        target = target.reshape(())
+    kept: Any = target != ignore_index
+    index = where(kept, target, 0)
+    losses = where(kept, -input.gather(axis, index.unsqueeze(axis)).squeeze(axis), 0.0)
+    return losses.sum() / kept.sum() if reduction == "mean" else _reduced(losses, reduction)
+
+
+def normalize(input: Tensor, p: float = 2.0, dim: int = 1, eps: float = 1e-12) -> Tensor:
+    if p != 2:
+        raise Missing(f"torch.nn.functional.normalize with p={p}")
+    return input / input.norm(2, dim, True).clamp(min=eps)
+
+
+def layer_norm(input: Tensor, normalized_shape: Sequence[int], weight: Any = None, bias: Any = None, eps: float = 1e-5) -> Tensor:
+    axes = tuple(range(input.ndim - len(normalized_shape), input.ndim))
+    result = (input - input.mean(axes, keepdim=True)) / (input.var(axes, unbiased=False, keepdim=True) + eps).sqrt()
+    result = result if weight is None else result * weight
+    return result if bias is None else result + bias
+
+
+def gaussian_nll_loss(
+    input: Tensor, target: Tensor, var: Any, full: bool = False, eps: float = 1e-6, reduction: str = "mean"
+) -> Tensor:
+    if not isinstance(var, Tensor):
+        var = input.new_full(input.shape, var)
+    if var.shape != input.shape and var.shape not in (input.shape[:-1], (*input.shape[:-1], 1)):
+        raise ValueError("var is of incorrect size")
+    if var.shape == input.shape[:-1] and var.shape != input.shape:
+        var = var.unsqueeze(-1)
+    if bool((var < 0).any()):
+        raise ValueError("var has negative entry/entries")
+    wide = var + (var.detach().clamp(min=eps) - var.detach())  # what is held up passes its gradient on all the same
+    losses = 0.5 * (wide.log() + (input - target) ** 2 / wide)
+    return _reduced(losses + 0.5 * math.log(2 * math.pi) if full else losses, reduction)
