@@ -29,6 +29,7 @@ from autograder.authoring import assemble
 from autograder.authoring.chapter import Chapter, all_chapters
 from autograder.paths import ROOT
 from autograder.proving.locks import one_at_a_time
+from autograder.publishing import in_page
 from autograder.publishing.execution import BookError, cache_folder, content_hash, executed_outputs, execution_key, run_all
 from autograder.publishing.format_page import format_page
 from autograder.publishing.located import relocated
@@ -104,7 +105,7 @@ def staged_files(chapters: list[Chapter], with_solutions: bool) -> dict[str, byt
         f"{chapter.number}. {chapter.title}": kill_rows(chapter, keys) for chapter in chapters
     }  # recorded, never drawn here
     files["kill-matrix.md"] = kill_matrix_page(matrix).encode()
-    return files | assets()
+    return files | assets() | practice_files(chapters, files, with_solutions)
 
 
 def staged_chapter(chapter: Chapter, outputs: assemble.Outputs, with_solutions: bool) -> dict[str, bytes]:
@@ -115,6 +116,12 @@ def staged_chapter(chapter: Chapter, outputs: assemble.Outputs, with_solutions: 
     page.cells[0].source += f"\n- **Notebook:** {{download}}`{name} <downloads/{name}>`"
     files = {f"{docname(chapter)}.ipynb": page, f"chapters/downloads/{name}": student}
     return {path: nbformat.writes(notebook).encode() for path, notebook in files.items()}
+
+
+def practice_files(chapters: list[Chapter], files: dict[str, bytes], with_solutions: bool) -> dict[str, bytes]:
+    """What practice in the pages of these chapters needs, of which `files` has the notebooks."""
+    notebooks = {chapter.assignment: files[f"chapters/downloads/{chapter.assignment}.ipynb"] for chapter in chapters}
+    return in_page.staged(chapters, notebooks, with_solutions)
 
 
 def docname(chapter: Chapter) -> str:
@@ -326,7 +333,7 @@ def _build_key(chapters: list[Chapter], with_solutions: bool) -> str:
     kept = [*(ROOT / "autograder" / "proving" / "records").glob("*.json"), ROOT / "requirements.txt", ROOT / "constraints.txt"]
     chapters_own = [chapter.path for chapter in chapters]
     outputs = [execution_key(chapter) for chapter in chapters]
-    return content_hash([str(with_solutions), *outputs], [*own, *code, *kept, ROOT / "_config.yml", *chapters_own])
+    return content_hash([str(with_solutions), in_page.fingerprint(), *outputs], [*own, *code, *kept, ROOT / "_config.yml", *chapters_own])
 
 
 def _is_current(out: Path, key: str) -> bool:
