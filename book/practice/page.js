@@ -24,6 +24,7 @@ const answers = new Map(offered.map(({cell, name}) => [name, new Answer(cell, na
 
 Object.assign(window.coursePractice, {
   data,
+  drafts: () => store.everything(everyName).drafts,
   exercises: [...answers.keys()],
   check: async (name, source) => {
     if (!answers.has(name)) throw new Error(`There is no exercise called ${name} on this page.`);
@@ -146,8 +147,7 @@ addEventListener("storage", progress);
 
 function progress() {
   const done = [...answers.keys()].filter((name) => store.passed(name)).length;
-  const refused = "This browser keeps nothing for pages like this one: save your drafts to a file before you leave.";
-  summary.textContent = `${done} of ${answers.size} passed here. ${store.kept ? "" : refused}`;
+  summary.textContent = `${done} of ${answers.size} passed here. ${keeping()}`;
   for (const [key, {page, exercises}] of Object.entries(chapters)) {
     const passed = exercises.filter((name) => store.passed(name)).length;
     const here = key === assignment ? ", nav.bd-links li.current.active > a" : "";
@@ -160,6 +160,13 @@ function progress() {
       link.append(element("span", {className: "practice-done"}, mark, words));
     });
   }
+}
+
+// What becomes of drafts, where that is not what one expects.
+function keeping() {
+  if (!store.kept) return "This browser keeps nothing for this page: save your drafts to a file before you leave.";
+  if (location.origin === "null") return "From disk, this browser keeps each page's drafts for that page alone.";
+  return "";
 }
 
 function download(name, text, type) {
