@@ -41,6 +41,7 @@ check: install
 	$(BIN)/ruff format --check
 	$(BIN)/python tools/format-chapters --check
 	$(BIN)/mypy
+	$(BIN)/mypy --explicit-package-bases book/practice
 	$(BIN)/python -m pytest -q $(IN_GROUPS) $(QUICK)
 
 bench: install

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, cast
@@ -254,7 +255,8 @@ def prove(
     jobs: Annotated[int, typer.Option(min=1, help="Processes at a time, one core each.")] = os.cpu_count() or 1,
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler, tcp://…, instead of --jobs.")] = None,
 ) -> None:
-    """Prove that the checks reject and name every misconception and accept every variant, and keep the record that the book prints.
+    """Prove that the checks reject and name every misconception and accept every variant, and keep the record that the book prints;
+    and so with what the book's pages can judge themselves.
 
     Only what has no fitting record is proved. Exit status: 0 all proved, 1 something found, 2 bad input, 3 the machinery failed.
     """
@@ -267,8 +269,10 @@ def prove(
         wanted = prover.targets(only or (), exercise or (), every or not writes)
     except prover.UnknownName as error:
         _stop(error)
+    on_pages = _judged_on_pages(only or (), every) if writes and not exercise else 0
     if not wanted:
-        print("Nothing to prove: every record fits (--all proves anew)")
+        if not on_pages:
+            print("Nothing to prove: every record fits (--all proves anew)")
         return
     keeper = prover.Keeper(wanted) if writes else None
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -298,6 +302,19 @@ def prove(
         _stop("some exercises could not be proved: run again; what is proved is kept", BROKEN)
     if any(outcome.findings for outcome in outcomes):
         _stop("some checks do not tell wrong from right; nothing is kept of these exercises", 1)
+
+
+def _judged_on_pages(only: Sequence[str], every: bool) -> int:
+    """Prove what pages can judge, and say what has changed. Returns how many exercises were proved."""
+    from autograder import checks
+    from autograder.proving import practice
+
+    keys, proved = practice.Keys(), 0
+    for assignment in only or checks.assignments():
+        for one in practice.prove(assignment, every, keys):
+            err.print(f"{assignment} {one.exercise}, on its page: {one.reason or 'offered'}", markup=False)
+            proved += 1
+    return proved
 
 
 @app.command()

@@ -1,5 +1,7 @@
-"""Judge a chapter's answers as a page of the book does. Run as a program, by autograder.proving.practice, with no package but the page's own:
-`python -S -E page_process.py`, a JSON text on standard input, another on standard output.
+"""Judge a chapter's answers as a page of the book does.
+
+A program, run by autograder.proving.practice with no package but the page's own: `python -S -E page_process.py`, a JSON text on standard
+input, another on standard output.
 
 The answers are functions of modules that import more than the page has. Of what is missing, modules may name all and call all while they
 are imported; when the answers are judged, every use says that it is missing.
@@ -39,11 +41,15 @@ def _lenient(torch: Any, names: Any, elsewhere: Any) -> Iterator[None]:
 def main() -> None:
     """Answer: for each exercise, for each answer, its state, misconceptions and message, and the seconds that it took."""
     task = json.load(sys.stdin)
-    sys.path[:] = [str(ROOT / "book" / "practice"), str(ROOT), *[path for path in sys.path if Path(path) != Path(__file__).parent]]
+    sys.path[:] = [
+        str(ROOT / "book" / "practice"),
+        str(ROOT),
+        *[path for path in sys.path if Path(path) != Path(__file__).parent],
+    ]
     import elsewhere
     import judge
     import torch
-    from torch import names
+    from torch import names  # type: ignore[attr-defined]  # of the page's torch
 
     sys.modules["course_lib"].__path__ = [str(ROOT / "course_lib")]
     with _lenient(torch, names, elsewhere):

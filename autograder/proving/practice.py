@@ -7,6 +7,7 @@ exercise (`records/practice/`), which fits as long as what it rests on is the sa
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import subprocess
@@ -27,7 +28,14 @@ from autograder.proving import kept
 FOLDER = kept.FOLDER / "practice"
 PAGE = ROOT / "book" / "practice"
 PROCESS = Path(__file__).with_name("page_process.py")
-LIBRARY = ("validate.py", "checks/__init__.py", "checks/cases.py", "checks/diagnosis.py", "checks/observing.py", "checks/results.py")
+LIBRARY = (
+    "validate.py",
+    "checks/__init__.py",
+    "checks/cases.py",
+    "checks/diagnosis.py",
+    "checks/observing.py",
+    "checks/results.py",
+)
 RESTS_ON = ("autograder.proving.practice:rows", "autograder.authoring.freeze:visible", "course_lib.checks.results:examined")
 ELSEWHERE = ("is not in the page; it is in the notebook", "is not in the page's torch; it is in the notebook")
 PATIENCE = 600  # seconds
@@ -82,10 +90,11 @@ def answers(chapter: Chapter) -> dict[str, str]:
     return {name: f"{one.signature}\n{one.docstring}\n{one.body}\n" for name, one in found.items()}
 
 
-def _text(exercise: Exercise) -> str:
+def _text(exercise: Exercise | Artefact) -> str:
     from autograder.authoring import freeze
     from course_lib.checks import stored
 
+    assert isinstance(exercise, Exercise)  # no other is offered
     return stored.to_text(freeze.visible(exercise))
 
 
@@ -194,13 +203,19 @@ class Keys(kept.Keys):
 
     def key(self, assignment: str, exercise: Exercise | Artefact) -> str:
         """A hash of all that it rests on: the exercise and its checks, the comparing code, the page's modules, the chapter's cells."""
-        digest = hashlib.sha256(super().key(assignment, exercise).encode())
-        digest.update(self.code.reach(RESTS_ON).fingerprint.encode())
+        own = super().key(assignment, exercise)
+        return hashlib.sha256(f"{own} {self._page} {self._chapter(assignment)}".encode()).hexdigest()[:16]
+
+    @functools.cached_property
+    def _page(self) -> str:
+        digest = hashlib.sha256(self.code.reach(RESTS_ON).fingerprint.encode() + PROCESS.read_bytes())
         for name, path in files().items():
             digest.update(name.encode() + path.read_bytes())
-        digest.update(PROCESS.read_bytes())
-        digest.update(json.dumps(_cells_and_answers(chapters.load(assignment)), sort_keys=True).encode())
-        return digest.hexdigest()[:16]
+        return digest.hexdigest()
+
+    @functools.cache  # noqa: B019  # as short-lived as the keys
+    def _chapter(self, assignment: str) -> str:
+        return json.dumps(_cells_and_answers(chapters.load(assignment)), sort_keys=True)
 
 
 def unproved(assignment: str, keys: Keys | None = None) -> dict[str, str]:
@@ -208,9 +223,9 @@ def unproved(assignment: str, keys: Keys | None = None) -> dict[str, str]:
     return kept.unproved(assignment, keys or Keys(), FOLDER)
 
 
-def prove(assignment: str, every: bool = False) -> Iterator[Agreement]:
+def prove(assignment: str, every: bool = False, keys: Keys | None = None) -> Iterator[Agreement]:
     """Judge and keep what has no fitting record, or everything."""
-    keys = Keys()
+    keys = keys or Keys()
     names = [one.name for one in checks.exercises(assignment)] if every else list(unproved(assignment, keys))
     if not names:
         return
@@ -224,7 +239,7 @@ def prove(assignment: str, every: bool = False) -> Iterator[Agreement]:
     yield from found
 
 
-def offered_in(assignment: str) -> list[str]:
+def offered_in(assignment: str, keys: Keys | None = None) -> list[str]:
     """The exercises that a chapter's page offers: those of which a fitting record says so."""
-    missing = unproved(assignment)
+    missing = unproved(assignment, keys)
     return [name for name, record in kept.load(assignment, FOLDER).items() if name not in missing and record.rows["offered"]]

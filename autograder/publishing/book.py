@@ -90,7 +90,8 @@ def _verify_all(chapters: list[Chapter]) -> None:
 
 def staged_files(chapters: list[Chapter], with_solutions: bool) -> dict[str, bytes]:
     """Everything that Sphinx reads, by path relative to the staging folder."""
-    from autograder.proving import kept
+    from autograder.proving import kept, practice
+    from autograder.publishing.practice_page import practice_page, practice_rows
 
     pages = [*BOOK.glob("*.md"), *BOOK.glob("how-to/*.md"), *BOOK.glob("*.bib")]
     files = {path.relative_to(BOOK).as_posix(): path.read_bytes() for path in pages}
@@ -105,6 +106,9 @@ def staged_files(chapters: list[Chapter], with_solutions: bool) -> dict[str, byt
         f"{chapter.number}. {chapter.title}": kill_rows(chapter, keys) for chapter in chapters
     }  # recorded, never drawn here
     files["kill-matrix.md"] = kill_matrix_page(matrix).encode()
+    pages_keys = practice.Keys()
+    judged = {f"{chapter.number}. {chapter.title}": practice_rows(chapter, pages_keys) for chapter in chapters}
+    files["practice.md"] = practice_page(judged).encode()
     return files | assets() | practice_files(chapters, files, with_solutions)
 
 
@@ -132,7 +136,7 @@ def docname(chapter: Chapter) -> str:
 def table_of_contents(chapters: list[Chapter]) -> dict:
     """sphinx-external-toc's table, from the chapters' front matter."""
     entries = [{"file": docname(chapter), "title": f"{chapter.number}. {chapter.title}"} for chapter in chapters]
-    appendices = [{"file": "notation"}, {"file": "kill-matrix"}, {"file": "format"}]
+    appendices = [{"file": "notation"}, {"file": "kill-matrix"}, {"file": "practice"}, {"file": "format"}]
     how_to = {"caption": "How to use this book", "chapters": [{"file": page} for page in HOW_TO]}
     parts = [how_to, {"caption": "Chapters", "chapters": entries}, {"caption": "Appendices", "chapters": appendices}]
     return {"format": "jb-book", "root": "index", "parts": parts}
@@ -330,7 +334,7 @@ def _build_key(chapters: list[Chapter], with_solutions: bool) -> str:
     more of the code than their outputs rest on, and rendering them again is quick."""
     own = [path for path in BOOK.rglob("*") if path.is_file() and not path.relative_to(BOOK).parts[0].startswith("_")]
     code = [path for folder in ("autograder", "course_lib", "solutions") for path in (ROOT / folder).rglob("*.py")]
-    kept = [*(ROOT / "autograder" / "proving" / "records").glob("*.json"), ROOT / "requirements.txt", ROOT / "constraints.txt"]
+    kept = [*(ROOT / "autograder" / "proving" / "records").rglob("*.json"), ROOT / "requirements.txt", ROOT / "constraints.txt"]
     chapters_own = [chapter.path for chapter in chapters]
     outputs = [execution_key(chapter) for chapter in chapters]
     return content_hash([str(with_solutions), in_page.fingerprint(), *outputs], [*own, *code, *kept, ROOT / "_config.yml", *chapters_own])

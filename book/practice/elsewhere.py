@@ -1,6 +1,6 @@
 """What a cell imports and the page does not have: a stand-in that can be named, and says so when it is used.
 
-`import numpy as np` works, `np.pi` too, and `np.array([1.0])` says that numpy is in the notebook. Nothing here pretends to be the real thing.
+`import numpy as np` works, `np.pi` too, and `np.array([1.0])` says that numpy is in the notebook.
 """
 
 from __future__ import annotations
@@ -13,10 +13,21 @@ from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
-from torch import missing
+from torch import missing  # type: ignore[attr-defined]  # of the page's torch
 
 PACKAGES = (
-    *("numpy", "scipy", "pandas", "matplotlib", "sklearn", "gymnasium", "transformers", "safetensors", "pyarrow", "huggingface_hub"),
+    *(
+        "numpy",
+        "scipy",
+        "pandas",
+        "matplotlib",
+        "sklearn",
+        "gymnasium",
+        "transformers",
+        "safetensors",
+        "pyarrow",
+        "huggingface_hub",
+    ),
     *("threadpoolctl", "IPython", "ipywidgets", "seaborn", "tqdm", "einops", "jax", "vaderSentiment", "course_lib", "torch"),
 )
 """What a notebook of the course may import; of any other name Python says that there is no such module, as it does there."""
@@ -53,7 +64,9 @@ class StandIn(type):
 
 def stand_in(what: str, where: str = "the page") -> StandIn:
     """For `what`, which is not in `where`."""
-    return StandIn(what.rpartition(".")[2], (), {"what": what, "where": where, "__init_subclass__": classmethod(lambda cls, **_kw: None)})
+    return StandIn(
+        what.rpartition(".")[2], (), {"what": what, "where": where, "__init_subclass__": classmethod(lambda cls, **_kw: None)}
+    )
 
 
 class _Module(ModuleType):

@@ -22,7 +22,7 @@ from typing import Any
 
 import elsewhere
 import torch
-from torch import missing
+from torch import missing  # type: ignore[attr-defined]  # of the page's torch
 
 HERE = Path(__file__).parent
 MAX_PRINTED = 10_000
@@ -112,7 +112,9 @@ def check(name: Any, source: str | None = None, answers: Mapping[str, str] | Non
     exercise = _exercise(name)
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-        namespace = _prepared(_page, {other: text for other, text in {**_page.answers, **(answers or {})}.items() if other != name})
+        namespace = _prepared(
+            _page, {other: text for other, text in {**_page.answers, **(answers or {})}.items() if other != name}
+        )
         missing.asked_for.clear()
         told, stopped = run_cell(source or "", namespace)
         if callable(namespace.get(name)):

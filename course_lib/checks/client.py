@@ -18,6 +18,7 @@ from course_lib.checks.stored import load
 
 FROZEN = Path(__file__).parents[1] / "frozen"
 
+
 def check(function: Callable) -> CheckResult:
     """Check your function on the visible cases and show what was found.
 

@@ -43,8 +43,9 @@ class Node:
 
     def result_is_written_to(self, result: Any, target: Any) -> None:
         """The result now lives in another tensor, over which it was written: that one must not change, then."""
-        self.relies_on = [(target if one is result else one, version) for one, version in self.relies_on]
-        self.relies_on = [(one, one.storage.version if one is target else version) for one, version in self.relies_on]
+        self.relies_on = [
+            (target, target.storage.version) if one is result else (one, version) for one, version in self.relies_on
+        ]
 
     def __repr__(self) -> str:
         return f"<{self.name} object>"
@@ -140,6 +141,8 @@ def grad(
     outputs = list(outputs) if isinstance(outputs, (tuple, list)) else [outputs]
     inputs = list(inputs) if isinstance(inputs, (tuple, list)) else [inputs]
     weights = list(grad_outputs) if isinstance(grad_outputs, (tuple, list)) else [grad_outputs] * len(outputs)
+    if not inputs:
+        raise RuntimeError("`inputs` argument to `grad()` cannot be empty.")
     seeds = [start(output, weight, number) for number, (output, weight) in enumerate(zip(outputs, weights, strict=True))]
     if not all(tensor.requires_grad for tensor in inputs):
         raise RuntimeError("One of the differentiated Tensors does not require grad")

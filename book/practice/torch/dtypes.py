@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
+import struct
 from array import array
 from collections.abc import Iterable
 from typing import Any
-
-from .missing import Missing
 
 
 class dtype:
@@ -31,8 +31,10 @@ class dtype:
 
     def numbers(self, values: Iterable[Any]) -> list[Any]:
         """The values as numbers of this kind: what a float32 cannot hold is rounded, as it is there."""
-        if self.name in ("float16", "bfloat16"):
-            raise Missing(f"torch.{self.name}")
+        if self.name == "float16":
+            return list(map(_half, values))
+        if self.name == "bfloat16":
+            return list(map(_brain, values))
         if self.name == "float32":
             return array("f", list(map(_single, values))).tolist()
         if self.name == "float64":
@@ -46,6 +48,23 @@ class dtype:
 def _single(value: Any) -> float:
     value = float(value)
     return value if -3.4028235677973366e38 < value < 3.4028235677973366e38 or value != value else value * float("inf")
+
+
+def _half(value: Any) -> float:
+    value = _single(value)
+    try:
+        return struct.unpack("<e", struct.pack("<e", value))[0]
+    except OverflowError:
+        return math.copysign(math.inf, value)
+
+
+def _brain(value: Any) -> float:
+    """The upper half of a float32, rounded to even."""
+    value = _single(value)
+    if value != value or abs(value) == math.inf:
+        return value
+    bits = struct.unpack("<I", struct.pack("<f", value))[0]
+    return struct.unpack("<f", struct.pack("<I", (bits + 0x7FFF + (bits >> 16 & 1)) & 0xFFFF0000))[0]
 
 
 def _whole(value: Any) -> int:
@@ -68,13 +87,22 @@ int64 = dtype("int64", "Long", 1, 3)
 float32 = dtype("float32", "Float", 2, 4)
 float64 = dtype("float64", "Double", 2, 5)
 float16 = dtype("float16", "Half", 2, 3.5)
-bfloat16 = dtype("bfloat16", "BFloat16", 2, 3.5)
-BY_NAME = {kind.name: kind for kind in (bool_, uint8, int8, int16, int32, int64, float32, float64)}
+bfloat16 = dtype("bfloat16", "BFloat16", 2, 3.4)
+BY_NAME = {kind.name: kind for kind in (bool_, uint8, int8, int16, int32, int64, float16, bfloat16, float32, float64)}
 
 
 def of_number(value: Any) -> dtype:
     """The kind of a Python number; a float is taken for the default, float32."""
     return bool_ if isinstance(value, bool) else int64 if isinstance(value, int) else float32
+
+
+def promoted(a: dtype, b: dtype) -> dtype:
+    """The kind that holds both, or nearly."""
+    if {a.name, b.name} == {"float16", "bfloat16"}:
+        return float32
+    if {a.name, b.name} == {"uint8", "int8"}:
+        return int16
+    return a if a.rank > b.rank else b
 
 
 def result_type(*operands: Any) -> dtype:
@@ -86,7 +114,7 @@ def result_type(*operands: Any) -> dtype:
         level = (0 if operand.shape else 1) if is_tensor else 2
         kind = operand.dtype if is_tensor else of_number(operand)
         held = levels[level]
-        levels[level] = kind if held is None or kind.rank > held.rank else held
+        levels[level] = kind if held is None else promoted(kind, held)
     decided: dtype | None = None
     for kind in levels:
         if kind is not None and (decided is None or kind.category > decided.category):

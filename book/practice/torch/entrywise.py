@@ -121,7 +121,7 @@ def log_logistic(x: float) -> float:
 def _power(a: float, b: float) -> float:
     if a == 0 and b < 0:
         return -inf if math.copysign(1, a) < 0 and b % 2 == 1 else inf
-    if a < 0 and isinstance(b, float) and b == b and abs(b) != inf and b != int(b):
+    if -inf < a < 0 and isinstance(b, float) and b == b and abs(b) != inf and b != int(b):
         return nan
     try:
         return a**b
@@ -129,7 +129,8 @@ def _power(a: float, b: float) -> float:
         return -inf if a < 0 and b % 2 == 1 else inf
 
 
-def _log_add_exp(a: float, b: float) -> float:
+def log_add_exp(a: float, b: float) -> float:
+    """log(exp a + exp b)."""
     if a != a or b != b:
         return nan
     top = max(a, b)
@@ -200,7 +201,13 @@ _NOT_OF_TRUTH_VALUES = {
     " `logical_not()` operator instead.",
     "relu": "Boolean inputs not supported for relu",
 }
-_NOT_IMPLEMENTED_OF_TRUTH_VALUES = {"abs": "abs", "floor": "floor", "ceil": "ceil", "round": "round", "trunc": "trunc"}
+_NOT_IMPLEMENTED_OF_TRUTH_VALUES = {
+    "abs": "abs",
+    "floor": "floor_vml",
+    "ceil": "ceil_vml",
+    "round": "round_vml",
+    "trunc": "trunc_vml",
+}
 
 
 def _of_one(name: str) -> Callable:
@@ -290,7 +297,21 @@ def _floor_of_quotient(a: Any, b: Any) -> Any:
 
 
 def floor_divide(input: Any, other: Any) -> Tensor:
-    return entrywise("floor_divide", _floor_of_quotient, None, [input, other])
+    return _underivable(entrywise("floor_divide", _floor_of_quotient, None, [input, other]), "floor_divide", [input, other])
+
+
+def _underivable(result: Tensor, name: str, operands: Sequence[Any]) -> Tensor:
+    """The result of an operation through which torch sends no gradient: asking for one is an error."""
+
+    def refuse(gradient: Tensor) -> list[Tensor]:
+        raise RuntimeError(f"derivative for aten::{name} is not implemented")
+
+    return record(result, "torch::autograd::NotImplemented", [x for x in operands if isinstance(x, Tensor)], refuse)
+
+
+def _no_truth_values(kernel: str, *operands: Any) -> None:
+    if dtypes.result_type(*operands) is dtypes.bool_:
+        raise NotImplementedError(f"\"{kernel}\" not implemented for 'Bool'")
 
 
 def _rest(a: Any, b: Any) -> Any:
@@ -305,6 +326,7 @@ def remainder(input: Any, other: Any) -> Tensor:
     def slope(a: float, b: float, y: float) -> float:
         return -float(_floor_of_quotient(a, b))
 
+    _no_truth_values("remainder_cpu", input, other)
     keeps = "others" if isinstance(other, Tensor) else "nothing"
     return entrywise("remainder", _rest, [lambda a, b, y: 1.0, slope], [input, other], keeps=keeps)
 
@@ -319,6 +341,8 @@ def power(input: Any, exponent: Any) -> Tensor:
         return 0.0 if a == 0 and b >= 0 else y * logarithm(a)
 
     kind = dtypes.result_type(input, exponent)
+    if kind is dtypes.bool_:
+        raise NotImplementedError("\"pow\" not implemented for 'Bool'")
     if kind.category == 1 and isinstance(exponent, int) and exponent < 0:
         raise RuntimeError("Integers to negative integer powers are not allowed.")
     return entrywise("pow", _power, [by_base, by_exponent], [input, exponent])
@@ -330,25 +354,31 @@ def _share(mine: float, others: float, larger: bool) -> float:
 
 
 def minimum(input: Tensor, other: Tensor) -> Tensor:
-    need_tensor("minimum", "input", 1, input), need_tensor("minimum", "other", 2, other)
+    need_tensor("minimum", "input", 1, input)
+    need_tensor("minimum", "other", 2, other)
     slopes = [lambda a, b, y: _share(a, b, False), lambda a, b, y: _share(b, a, False)]
     return entrywise("minimum", _smaller, slopes, [input, other], chooses=True)
 
 
 def maximum(input: Tensor, other: Tensor) -> Tensor:
-    need_tensor("maximum", "input", 1, input), need_tensor("maximum", "other", 2, other)
+    need_tensor("maximum", "input", 1, input)
+    need_tensor("maximum", "other", 2, other)
     slopes = [lambda a, b, y: _share(a, b, True), lambda a, b, y: _share(b, a, True)]
     return entrywise("maximum", _larger, slopes, [input, other], chooses=True)
 
 
 def logaddexp(input: Tensor, other: Tensor) -> Tensor:
-    need_tensor("logaddexp", "input", 1, input), need_tensor("logaddexp", "other", 2, other)
+    need_tensor("logaddexp", "input", 1, input)
+    need_tensor("logaddexp", "other", 2, other)
     slopes = [lambda a, b, y: exponential(a - y), lambda a, b, y: exponential(b - y)]
-    return entrywise("logaddexp", _log_add_exp, slopes, [input, other], max(float_kind(input), float_kind(other), key=_rank))
+    floats_only("logaddexp_cpu", dtypes.result_type(input, other))
+    return entrywise("logaddexp", log_add_exp, slopes, [input, other])
 
 
-def _rank(kind: dtypes.dtype) -> float:
-    return kind.rank
+def floats_only(kernel: str, kind: dtypes.dtype) -> None:
+    """Refuse integers, as torch does where an operation has no meaning for them."""
+    if not kind.is_floating_point:
+        raise NotImplementedError(f"\"{kernel}\" not implemented for '{kind.long_name}'")
 
 
 # ------------------------------------------------------------------------------------------------- choosing, and of several
@@ -363,7 +393,7 @@ def clamp(input: Tensor, min: Any = None, max: Any = None) -> Tensor:
         raise TypeError(f"clamp() received an invalid combination of arguments - got (Tensor, {kinds})")
     operands = [input, -inf if min is None else min, inf if max is None else max]
     kind = dtypes.result_type(*(x for x in (input, min, max) if x is not None))
-    if kind is dtypes.bool_:
+    if kind is dtypes.bool_ and not isinstance(min, Tensor) and not isinstance(max, Tensor):
         raise NotImplementedError("\"clamp_scalar_cpu\" not implemented for 'Bool'")
     slopes = [
         lambda x, low, high, y: float(low <= x <= high),
@@ -408,6 +438,9 @@ def masked_fill(input: Tensor, mask: Tensor, value: Any) -> Tensor:
         raise RuntimeError(
             f"masked_fill only supports a 0-dimensional value tensor, but got tensor with {value.ndim} dimension{plural}."
         )
+    number = value.item() if isinstance(value, Tensor) else value
+    if input.dtype.category == 1 and isinstance(number, float) and (number != number or abs(number) >= 2**63):
+        raise RuntimeError("value cannot be converted to type int64_t without overflow")
     filler = tensor_like(value, None if isinstance(value, Tensor) else input.dtype)
     return where(mask, filler.to(input.dtype), input)
 
@@ -428,11 +461,24 @@ def addcdiv(input: Tensor, tensor1: Tensor, tensor2: Tensor, *, value: float = 1
 
 
 def lerp(input: Tensor, end: Tensor, weight: Any) -> Tensor:
-    return input + weight * (end - input)
+    if input.dtype is not end.dtype:
+        raise RuntimeError(f"expected dtype {input.dtype.c_name} for `end` but got dtype {end.dtype.c_name}")
+    floats_only("lerp_kernel_scalar", input.dtype)
+    if isinstance(weight, Tensor):
+        return input + weight * (end - input)
+    return input + weight * (end - input) if weight < 0.5 else end - (end - input) * (1 - weight)
 
 
 def xlogy(input: Any, other: Any) -> Tensor:
-    return where(tensor_like(input) == 0, 0.0, input * OF_ONE["log"](tensor_like(other)))
+    def compute(a: float, b: float) -> float:
+        return nan if b != b else 0.0 if a == 0 else a * logarithm(b)
+
+    def slope(a: float, b: float, y: float) -> float:
+        return 0.0 if a == 0 and b <= 0 else logarithm(b)
+
+    kind = dtypes.result_type(input, other)
+    kind = kind if kind.is_floating_point else dtypes.float32
+    return entrywise("xlogy", compute, [slope, lambda a, b, y: divide(a, b)], [input, other], kind)
 
 
 # ------------------------------------------------------------------------------------------------------------- comparing

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from typing import Any
 
 from . import dtypes
-from .entrywise import OF_ONE, entrywise, exponential, log_logistic, logistic, where
+from .entrywise import OF_ONE, entrywise, exponential, floats_only, log_logistic, logistic, where
 from .making import full, make
 from .missing import Missing, missing
 from .moving import cat
 from .rows import log_softmax
+from .shapes import broadcast_shapes
 from .tensor import Tensor
 
 sigmoid, tanh, relu = OF_ONE["sigmoid"], OF_ONE["tanh"], OF_ONE["relu"]
@@ -32,12 +33,14 @@ def _softplus(x: float) -> float:
 
 
 def softplus(input: Tensor, beta: float = 1.0, threshold: float = 20.0) -> Tensor:
+    floats_only("softplus_cpu", input.dtype)
     if beta != 1 or threshold != 20:
         return softplus(input * beta) / beta
     return entrywise("softplus", _softplus, [lambda x, y: 1.0 if x > 20 else logistic(x)], [input])
 
 
 def silu(input: Tensor) -> Tensor:
+    floats_only("silu_cpu", input.dtype)
     return input * sigmoid(input)
 
 
@@ -45,6 +48,12 @@ def one_hot(tensor: Tensor, num_classes: int = -1) -> Tensor:
     if tensor.dtype is not dtypes.int64:
         raise RuntimeError(f"one_hot is only applicable to index tensor of type LongTensor. Got {tensor.dtype.long_name}")
     entries = tensor.flat()
+    if min(entries, default=0) < 0:
+        raise RuntimeError("Class values must be non-negative.")
+    if num_classes == -1 and not entries:
+        raise RuntimeError("Can not infer total number of classes from empty tensor.")
+    if num_classes != -1 and max(entries, default=-1) >= num_classes:
+        raise RuntimeError("Class values must be smaller than num_classes.")
     classes = num_classes if num_classes != -1 else max(entries) + 1
     return make([i == entry for entry in entries for i in range(classes)], (*tensor.shape, classes), dtypes.int64)
 
@@ -53,6 +62,11 @@ def pad(input: Tensor, pad: Sequence[int], mode: str = "constant", value: float 
     if mode != "constant":
         raise Missing(f"torch.nn.functional.pad with mode={mode!r}")
     result = input
+    if len(pad) > 2 * input.ndim:
+        raise RuntimeError(
+            "Padding length should be less than or equal to two times the input dimension but got padding length"
+            f" {len(pad)} and input of dimension {input.ndim}"
+        )
     for number in range(len(pad) // 2):
         axis = input.ndim - 1 - number
         before, after = pad[2 * number], pad[2 * number + 1]
@@ -72,20 +86,30 @@ def _reduced(losses: Tensor, reduction: str) -> Tensor:
     return losses if reduction == "none" else losses.mean() if reduction == "mean" else losses.sum()
 
 
+def _together(kernel: str, input: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    shape = broadcast_shapes(input.shape, target.shape)
+    floats_only(kernel, dtypes.result_type(input.expand(shape), target.expand(shape)))
+    return input.expand(shape), target.expand(shape)
+
+
 def mse_loss(input: Tensor, target: Tensor, reduction: str = "mean") -> Tensor:
+    input, target = _together("mse_cpu", input, target)
     return _reduced((input - target) ** 2, reduction)
 
 
 def l1_loss(input: Tensor, target: Tensor, reduction: str = "mean") -> Tensor:
-    return _reduced((input - target).abs(), reduction)
+    shape = broadcast_shapes(input.shape, target.shape)
+    return _reduced((input.expand(shape) - target.expand(shape)).abs(), reduction)
 
 
 def smooth_l1_loss(input: Tensor, target: Tensor, reduction: str = "mean", beta: float = 1.0) -> Tensor:
+    input, target = _together("smooth_l1_cpu", input, target)
     distance = (input - target).abs()
     return _reduced(where(distance < beta, 0.5 * distance**2 / beta, distance - 0.5 * beta), reduction)
 
 
 def huber_loss(input: Tensor, target: Tensor, reduction: str = "mean", delta: float = 1.0) -> Tensor:
+    input, target = _together("huber_cpu", input, target)
     distance = (input - target).abs()
     return _reduced(where(distance <= delta, 0.5 * distance**2, delta * (distance - 0.5 * delta)), reduction)
 
@@ -110,19 +134,29 @@ def cross_entropy(
     reduction: str = "mean",
     label_smoothing: float = 0.0,
 ) -> Tensor:
-    if weight is not None or label_smoothing:
-        raise Missing("torch.nn.functional.cross_entropy with weight= or label_smoothing=")
+    if weight is not None:
+        raise Missing("torch.nn.functional.cross_entropy with weight=")
     axis = 0 if input.ndim == 1 else 1
     logps = log_softmax(input, axis)
+    classes = input.shape[axis]
     if target.dtype.is_floating_point:
-        losses = -(logps * target).sum(axis)
-        return _reduced(losses, reduction) if reduction != "mean" else losses.sum() / max(losses.numel(), 1)
-    return nll_loss(logps, target, ignore_index=ignore_index, reduction=reduction)
+        smooth = target * (1 - label_smoothing) + label_smoothing / classes if label_smoothing else target
+        losses = -(logps * smooth).sum(axis)
+        return _reduced(losses, reduction) if reduction != "mean" else losses.sum() / losses.numel()
+    losses = nll_loss(logps, target, ignore_index=ignore_index, reduction=reduction)
+    if not label_smoothing:
+        return losses
+    kept = target != ignore_index
+    spread = where(kept, -logps.sum(axis), 0.0)
+    spread = spread.sum() / kept.sum() if reduction == "mean" else _reduced(spread, reduction)
+    return (1 - label_smoothing) * losses + label_smoothing / classes * spread
 
 
 def nll_loss(input: Tensor, target: Tensor, weight: Any = None, ignore_index: int = -100, reduction: str = "mean") -> Tensor:
     axis = 0 if input.ndim == 1 else 1
-    kept = target != ignore_index
+    if input.ndim == 1 and target.ndim == 1 and target.shape == (1,):
+        target = target.reshape(())
+    kept: Any = target != ignore_index
     index = where(kept, target, 0)
     losses = where(kept, -input.gather(axis, index.unsqueeze(axis)).squeeze(axis), 0.0)
     return losses.sum() / kept.sum() if reduction == "mean" else _reduced(losses, reduction)
@@ -131,7 +165,7 @@ def nll_loss(input: Tensor, target: Tensor, weight: Any = None, ignore_index: in
 def normalize(input: Tensor, p: float = 2.0, dim: int = 1, eps: float = 1e-12) -> Tensor:
     if p != 2:
         raise Missing(f"torch.nn.functional.normalize with p={p}")
-    return input / (input**2).sum(dim, keepdim=True).sqrt().clamp(min=eps)
+    return input / input.norm(2, dim, True).clamp(min=eps)
 
 
 def layer_norm(input: Tensor, normalized_shape: Sequence[int], weight: Any = None, bias: Any = None, eps: float = 1e-5) -> Tensor:
@@ -139,3 +173,19 @@ def layer_norm(input: Tensor, normalized_shape: Sequence[int], weight: Any = Non
     result = (input - input.mean(axes, keepdim=True)) / (input.var(axes, unbiased=False, keepdim=True) + eps).sqrt()
     result = result if weight is None else result * weight
     return result if bias is None else result + bias
+
+
+def gaussian_nll_loss(
+    input: Tensor, target: Tensor, var: Any, full: bool = False, eps: float = 1e-6, reduction: str = "mean"
+) -> Tensor:
+    if not isinstance(var, Tensor):
+        var = input.new_full(input.shape, var)
+    if var.shape != input.shape and var.shape not in (input.shape[:-1], (*input.shape[:-1], 1)):
+        raise ValueError("var is of incorrect size")
+    if var.shape == input.shape[:-1] and var.shape != input.shape:
+        var = var.unsqueeze(-1)
+    if bool((var < 0).any()):
+        raise ValueError("var has negative entry/entries")
+    wide = var + (var.detach().clamp(min=eps) - var.detach())  # what is held up passes its gradient on all the same
+    losses = 0.5 * (wide.log() + (input - target) ** 2 / wide)
+    return _reduced(losses + 0.5 * math.log(2 * math.pi) if full else losses, reduction)

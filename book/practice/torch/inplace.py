@@ -26,6 +26,8 @@ def in_place(function: Callable, name: str) -> Callable:
         self.write(result)
         if step is not None:
             step.result_is_written_to(result, self)
+            if self.base is None and self.step is not None:
+                self.step.name = step.name
         return self
 
     changed.__name__ = name

@@ -117,9 +117,7 @@ def to(input: Tensor, *args: Any, dtype: Any = None, device: Any = None, copy: b
             raise Missing(f"torch.device({str(argument)!r})")
     if dtype is None or (dtype is input.dtype and not copy):
         return input.clone() if copy else input
-    result = make(
-        map(int, input.flat()) if dtype.category == 1 and input.dtype.category == 2 else input.flat(), input.shape, dtype
-    )
+    result = make(input.flat(), input.shape, dtype)
     return record(result, "ToCopyBackward0", [input], lambda gradient: [make(gradient.flat(), input.shape, input.dtype)])
 
 

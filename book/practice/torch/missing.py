@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import inspect
 from collections.abc import Iterable, Mapping
 from types import ModuleType
 from typing import Any
@@ -49,7 +51,16 @@ def real_names(torch: ModuleType) -> dict[str, list[str]]:
         for part in path.split(".")[1:]:
             value = getattr(value, part)
         found[owner] = sorted(name for name in dir(value) if not name.startswith("__"))
-    return found
+    words = {argument.name for schema in torch._C._jit_get_all_schemas() for argument in schema.arguments}
+    for name in found["torch.nn.functional"]:
+        with contextlib.suppress(TypeError, ValueError):  # what is no function, or written in C++
+            words |= set(inspect.signature(getattr(torch.nn.functional, name)).parameters)
+    return found | {"keywords": sorted(words)}
+
+
+def has_keyword(word: str) -> bool:
+    """Whether any of torch's functions has an argument of this name, as far as is known."""
+    return "keywords" not in REAL or word in REAL["keywords"]
 
 
 def know(names: Mapping[str, Iterable[str]]) -> None:

@@ -42,13 +42,17 @@ def picked(input: Tensor, dim: int, index: Tensor) -> Tensor:
     """`gather`, of which no step relies on what the entries were."""
     if index.dtype is not dtypes.int64:
         raise RuntimeError("gather(): Expected dtype int32/int64 for index")
-    if index.ndim != input.ndim:
+    if max(index.ndim, 1) != max(input.ndim, 1) and count(index.shape):
         raise RuntimeError("Index tensor must have the same number of dimensions as input tensor")
     axis = axis_of(dim, input.ndim)
+    if not input.ndim or not index.ndim:
+        return picked(input.reshape(1) if not input.ndim else input, 0, index.reshape(-1)).reshape(index.shape)
     if any(size > own for i, (size, own) in enumerate(zip(index.shape, input.shape, strict=True)) if i != axis):
+        sizes = enumerate(zip(index.shape, input.shape, strict=True))
+        number = next(i for i, (size, own) in sizes if i != axis and size > own)
         raise RuntimeError(
-            f"Size does not match at dimension {next(i for i, (s, o) in enumerate(zip(index.shape, input.shape, strict=True)) if i != axis and s > o)}"
-            f" expected index {list(index.shape)} to be no larger than self {list(input.shape)} apart from dimension {dim}"
+            f"Size does not match at dimension {number} expected index {list(index.shape)} to be no larger than self"
+            f" {list(input.shape)} apart from dimension {dim}"
         )
     strides = list(strides_of(input.shape))
     along, strides[axis : axis + 1] = strides[axis] if strides else 1, [0] if strides else []
@@ -60,11 +64,31 @@ def picked(input: Tensor, dim: int, index: Tensor) -> Tensor:
     return _rearranged("Gather", input, places, index.shape)
 
 
-take_along_dim = lambda input, indices, dim: gather(input, dim, indices)  # noqa: E731
+def take_along_dim(input: Tensor, indices: Tensor, dim: int) -> Tensor:
+    axis = axis_of(dim, input.ndim)
+    if indices.dtype is not dtypes.int64:
+        raise RuntimeError(f"torch.take_along_dim(): dtype of indices should be Long but got {indices.dtype.long_name}")
+    if indices.ndim != input.ndim:
+        raise RuntimeError(
+            "torch.take_along_dim(): input and indices should have the same number of dimensions, but got"
+            f" {input.ndim} dimensions for input, and {indices.ndim} dimensions for indices"
+        )
+    lengths = list(broadcast_shapes(*([*x.shape[:axis], 1, *x.shape[axis + 1 :]] for x in (input, indices))))
+    wide = [x.expand([*lengths[:axis], x.shape[axis], *lengths[axis + 1 :]]) for x in (input, indices)]
+    return gather(wide[0], axis, wide[1])
 
 
 def index_select(input: Tensor, dim: int, index: Tensor) -> Tensor:
-    return input[(slice(None),) * axis_of(dim, input.ndim) + (index,)]
+    axis = axis_of(dim, input.ndim)
+    if index.ndim > 1:
+        raise IndexError("index_select(): Index is supposed to be a vector")
+    if not input.ndim:
+        if count(index.shape) != 1:
+            raise RuntimeError(f"index_select(): Index to scalar can have only 1 value, got {count(index.shape)} value(s)")
+        return input.reshape(1)[index.reshape(1)].reshape(())
+    if any(not 0 <= entry < input.shape[axis] for entry in index.flat()):
+        raise IndexError("index out of range in self")
+    return input[(slice(None),) * axis + (index.reshape(-1),)]
 
 
 def masked_select(input: Tensor, mask: Tensor) -> Tensor:
@@ -104,12 +128,15 @@ def roll(input: Tensor, shifts: Any, dims: Any = None) -> Tensor:
     for shift, dim in pairs:
         axis = axis_of(dim, input.ndim)
         size = input.shape[axis]
-        places = index_select(places, axis, tensor([(i - shift) % size for i in range(size)]))
+        places = index_select(places, axis, tensor([(i - shift) % size for i in range(size)], dtype=dtypes.int64))
     return _rearranged("Roll", input, places.flat(), input.shape)
 
 
 def cat(tensors: Sequence[Tensor], dim: int = 0) -> Tensor:
     tensors = list(tensors)
+    for number, other in enumerate(tensors):
+        if not isinstance(other, Tensor):
+            raise TypeError(f"expected Tensor as element {number} in argument 0, but got {type(other).__name__}")
     if not tensors:
         raise ValueError("torch.cat(): expected a non-empty list of Tensors")
     if any(not t.shape for t in tensors):
@@ -132,7 +159,12 @@ def cat(tensors: Sequence[Tensor], dim: int = 0) -> Tensor:
     shape[axis] = sum(t.shape[axis] for t in tensors)
     outer, flats = count(shape[:axis]), [t.flat() for t in tensors]
     widths = [count(t.shape[axis:]) for t in tensors]
-    numbers = [value for i in range(outer) for flat, width in zip(flats, widths, strict=True) for value in flat[i * width : (i + 1) * width]]
+    numbers = [
+        value
+        for i in range(outer)
+        for flat, width in zip(flats, widths, strict=True)
+        for value in flat[i * width : (i + 1) * width]
+    ]
 
     def send_back(gradient: Tensor) -> list[Tensor]:
         back, at = [], 0
@@ -150,32 +182,45 @@ concat = concatenate = cat
 
 def stack(tensors: Sequence[Tensor], dim: int = 0) -> Tensor:
     tensors = list(tensors)
+    for number, other in enumerate(tensors):
+        if not isinstance(other, Tensor):
+            raise TypeError(f"expected Tensor as element {number} in argument 0, but got {type(other).__name__}")
     if not tensors:
         raise RuntimeError("stack expects a non-empty TensorList")
     for number, other in enumerate(tensors):
         if other.shape != tensors[0].shape:
             raise RuntimeError(
-                f"stack expects each tensor to be equal size, but got {list(tensors[0].shape)} at entry 0 and {list(other.shape)} at entry {number}"
+                f"stack expects each tensor to be equal size, but got {list(tensors[0].shape)} at entry 0 and {list(other.shape)} at entry"
+                f" {number}"
             )
     axis = axis_of(dim, tensors[0].ndim + 1)
     return cat([t.unsqueeze(axis) for t in tensors], axis)
 
 
 def tril(input: Tensor, diagonal: int = 0) -> Tensor:
-    return _triangle(input, lambda i, j: j - i <= diagonal)
+    return _triangle("tril", input, lambda i, j: j - i <= diagonal)
 
 
 def triu(input: Tensor, diagonal: int = 0) -> Tensor:
-    return _triangle(input, lambda i, j: j - i >= diagonal)
+    return _triangle("triu", input, lambda i, j: j - i >= diagonal)
 
 
-def _triangle(x: Tensor, keeps: Callable[[int, int], bool]) -> Tensor:
+def _nothing(x: Tensor) -> Any:
+    """0, or False."""
+    return False if x.dtype is dtypes.bool_ else 0
+
+
+def _triangle(name: str, x: Tensor, keeps: Callable[[int, int], bool]) -> Tensor:
+    if x.ndim < 2:
+        raise RuntimeError(f"{name}: input tensor must have at least 2 dimensions")
     rows, columns = x.shape[-2:]
-    return where(make([keeps(i, j) for i in range(rows) for j in range(columns)], (rows, columns), dtypes.bool_), x, 0)
+    return where(make([keeps(i, j) for i in range(rows) for j in range(columns)], (rows, columns), dtypes.bool_), x, _nothing(x))
 
 
 def repeat(input: Tensor, *sizes: Any) -> Tensor:
     times = sizes_of(sizes)
+    if len(times) < input.ndim:
+        raise RuntimeError("Number of dimensions of repeat dims can not be smaller than number of dimensions of tensor")
     x = input.reshape((1,) * (len(times) - input.ndim) + tuple(input.shape))
     places = _own_places(x)
     for axis, number in enumerate(times):
@@ -194,8 +239,34 @@ def index_add(input: Tensor, dim: int, index: Tensor, source: Tensor) -> Tensor:
     return _added(input, dim, index, source)
 
 
+def _fits_index(name: str, x: Tensor, axis: int, index: Tensor, source: Tensor) -> None:
+    if index.ndim > 1:
+        raise IndexError(
+            f"{name}(): Index is supposed to be a vector, but got dim: {index.ndim} with type: {index.dtype.long_name} and size:"
+            f" {list(index.shape)}"
+        )
+    if x.dtype is not source.dtype:
+        kinds = f"self ({x.dtype.long_name}) and source ({source.dtype.long_name})"
+        raise RuntimeError(f"{name}(): {kinds} must have the same scalar type")
+    if source.ndim and axis < source.ndim and source.shape[axis] != count(index.shape):
+        raise RuntimeError(
+            f"{name}(): Number of indices ({count(index.shape)}) should be equal to source.size(dim): ({source.shape[axis]}), for dim:"
+            f" {axis}"
+        )
+    if (
+        not x.ndim
+        or source.ndim != x.ndim
+        or any(a != b for i, (a, b) in enumerate(zip(x.shape, source.shape, strict=True)) if i != axis)
+    ):
+        raise RuntimeError(
+            "source tensor shape must match self tensor shape, excluding the specified dimension. Got self.shape ="
+            f" {list(x.shape)} source.shape = {list(source.shape)}"
+        )
+
+
 def _added(x: Tensor, dim: int, index: Tensor, source: Tensor) -> Tensor:
     axis = axis_of(dim, x.ndim)
+    _fits_index("index_add_", x, axis, index, source)
     targets = index_select(_own_places(x), axis, index).flat()
     numbers = x.flat()
     for place, value in zip(targets, source.flat(), strict=True):
@@ -251,6 +322,8 @@ def flipud(input: Tensor) -> Tensor:
 
 
 def index_fill(input: Tensor, dim: int, index: Tensor, value: Any) -> Tensor:
+    if index.ndim > 1:
+        raise RuntimeError("Index has to be a vector/scalar")
     result = input.clone()
     result[(slice(None),) * axis_of(dim, input.ndim) + (index,)] = value
     return result
@@ -272,6 +345,20 @@ def vstack(tensors: Sequence[Tensor]) -> Tensor:
 def meshgrid(*tensors: Any, indexing: str = "ij") -> tuple[Tensor, ...]:
     if indexing != "ij":
         raise Missing(f"torch.meshgrid with indexing={indexing!r}")
-    tensors = tensors[0] if len(tensors) == 1 and isinstance(tensors[0], (tuple, list)) else tensors
+    tensors = tuple(tensors[0]) if len(tensors) == 1 and isinstance(tensors[0], (tuple, list)) else tensors
     shape = [t.numel() for t in tensors]
     return tuple(t.reshape([-1 if i == axis else 1 for i in range(len(shape))]).expand(shape) for axis, t in enumerate(tensors))
+
+
+def diag(input: Tensor, diagonal: int = 0) -> Tensor:
+    if diagonal:
+        raise Missing("torch.diag with diagonal=")
+    if input.ndim not in (1, 2):
+        raise RuntimeError(f"diag(): Supports 1D or 2D tensors. Got {input.ndim}D")
+    return input.diagonal().clone() if input.ndim == 2 else diag_embed(input)
+
+
+def diag_embed(input: Tensor) -> Tensor:
+    size = input.shape[-1]
+    main = make([i == j for i in range(size) for j in range(size)], (size, size), dtypes.bool_)
+    return where(main, input.unsqueeze(-1), _nothing(input))

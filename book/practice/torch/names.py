@@ -15,21 +15,22 @@ from typing import Any
 
 from . import autograd, dtypes, entrywise, functional, making, moving, products, reductions, rows, views
 from .inplace import in_place
-from .missing import Missing, missing
+from .missing import Missing, has_keyword, missing
 from .shapes import Size, broadcast_shapes
 from .tensor import Tensor
 
 _FUNCTIONS = {
-    entrywise: """add sub mul div floor_divide remainder pow=power minimum maximum logaddexp clamp clamp_min clamp_max where addcmul addcdiv
-        masked_fill masked_scatter nan_to_num lerp xlogy bitwise_and bitwise_or bitwise_xor bitwise_not isclose allclose equal""",
-    reductions: """sum=sum_ mean nansum nanmean norm var std prod all=all_ any=any_ count_nonzero max=max_ min=min_ amax amin aminmax argmax argmin
-        logsumexp corrcoef cov""",
-    rows: """median quantile log_softmax softmax cumsum cumprod cummax cummin logcumsumexp argsort sort topk kthvalue diff unique_consecutive
-        bincount""",
-    moving: """gather index_select masked_select nonzero argwhere take flip fliplr flipud roll tril triu repeat_interleave index_add index_fill
-        index_copy scatter scatter_add take_along_dim""",
-    views: """reshape flatten unsqueeze squeeze permute transpose t movedim broadcast_to narrow select unbind split chunk diagonal unflatten
-        ravel""",
+    entrywise: """add sub mul div floor_divide remainder pow=power minimum maximum logaddexp clamp clamp_min clamp_max where
+        addcmul addcdiv masked_fill masked_scatter nan_to_num lerp xlogy bitwise_and bitwise_or bitwise_xor
+        bitwise_not isclose allclose equal""",
+    reductions: """sum=sum_ mean nansum nanmean norm var std prod all=all_ any=any_ count_nonzero max=max_ min=min_ amax amin
+        aminmax argmax argmin logsumexp corrcoef cov""",
+    rows: """median quantile log_softmax softmax cumsum cumprod cummax cummin logcumsumexp argsort sort topk kthvalue
+        diff unique_consecutive bincount""",
+    moving: """gather index_select masked_select nonzero argwhere take flip fliplr flipud roll tril triu diag diag_embed
+        repeat_interleave index_add index_fill index_copy scatter scatter_add take_along_dim""",
+    views: """reshape flatten unsqueeze squeeze permute transpose t movedim broadcast_to narrow select unbind split
+        chunk diagonal unflatten ravel""",
     products: "matmul mm bmm mv dot inner outer vdot",
     making: "clone",
 }
@@ -38,7 +39,7 @@ _NO_METHODS = {
     reductions: "var_mean std_mean",
     moving: "cat stack hstack vstack meshgrid",
     views: "broadcast_tensors",
-    products: "addmm=addmm_",
+    products: "addmm=addmm_ cdist",
 }
 _METHODS_ONLY = {views: "view expand", making: "contiguous to", moving: "repeat"}
 _ALIASES = {
@@ -47,21 +48,26 @@ _ALIASES = {
     "swapdims": "transpose", "moveaxis": "movedim", "arctan": "atan", "arctanh": "atanh",
 }  # fmt: skip
 _NO_METHODS_BUT_ALIASES = {"concat": "cat", "concatenate": "cat"}
-_IN_PLACE = ["add", "sub", "mul", "div", "pow", "clamp", "clamp_min", "clamp_max", "addcmul", "addcdiv", "masked_fill", "masked_scatter", "exp", "log", "neg", "abs", "sqrt", "rsqrt", "sigmoid", "tanh", "relu", "square", "reciprocal", "floor", "ceil", "round", "trunc", "nan_to_num", "lerp", "index_add", "index_fill", "index_copy", "scatter", "scatter_add", "cumsum", "cumprod", "logical_not", "floor_divide", "remainder", "log1p", "expm1", "erf", "sign", "clip", "subtract", "multiply", "divide", "tril", "triu", "bitwise_and", "bitwise_or", "bitwise_xor", "bitwise_not", "logical_and", "logical_or", "eq", "ne", "lt", "le", "gt", "ge"]
+_IN_PLACE = """
+add sub mul div pow clamp clamp_min clamp_max addcmul addcdiv masked_fill masked_scatter exp log neg abs sqrt
+rsqrt sigmoid tanh relu square reciprocal floor ceil round trunc nan_to_num lerp index_add index_fill
+index_copy scatter scatter_add cumsum cumprod logical_not floor_divide remainder log1p expm1 erf sign clip
+subtract multiply divide tril triu bitwise_and bitwise_or bitwise_xor bitwise_not logical_and logical_or eq ne
+lt le gt ge
+"""
 _OTHER_NAMES = {"axis": "dim", "keepdims": "keepdim", "x": "input"}
-_KEYWORDS_OF_TORCH = frozenset(
-    ["out", "dtype", "device", "layout", "pin_memory", "requires_grad", "memory_format", "generator", "non_blocking", "copy", "weight", "pos_weight", "size_average", "reduce", "reduction", "decimals", "side", "right", "sorter", "interpolation", "prepend", "append", "include_self", "accumulate", "create_graph", "inputs", "inplace", "beta", "approximate", "alpha", "rounding_mode", "stable", "descending", "sorted", "largest", "largest", "unbiased", "correction", "keepdim", "p", "q", "tol", "hermitian"]
-)
 
 
 def _found(table: dict[ModuleType, str]) -> dict[str, Callable]:
-    pairs = [(module, *entry.split("=")) for module, entries in table.items() for entry in entries.split()]
-    return {name: getattr(module, rest[0] if rest else name) for module, name, *rest in pairs}
+    pairs = [(module, entry.partition("=")) for module, entries in table.items() for entry in entries.split()]
+    return {name: getattr(module, own or name) for module, (name, _, own) in pairs}
 
 
 def _public(owner: str, name: str, function: Callable) -> Callable:
     """The function under torch's name, taking what else torch calls its arguments, and speaking up about those that it does not have."""
     parameters = inspect.signature(function).parameters
+    first = next(iter(parameters.values()), None)
+    needs_tensor = first is not None and first.name == "input" and first.annotation == "Tensor"
     takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
 
     @functools.wraps(function)
@@ -73,10 +79,12 @@ def _public(owner: str, name: str, function: Callable) -> Callable:
                 kwargs[_OTHER_NAMES[word]] = kwargs.pop(word)
             elif word == "out" and kwargs[word] is None:
                 del kwargs[word]
-            elif word in _KEYWORDS_OF_TORCH:
+            elif has_keyword(word):
                 raise Missing(f"{owner}.{name} with {word}=")
             else:
                 raise TypeError(f"{name}() got an unexpected keyword argument '{word}'")
+        if needs_tensor and args and not isinstance(args[0], Tensor):
+            raise TypeError(f"{name}(): argument 'input' (position 1) must be Tensor, not {type(args[0]).__name__}")
         return function(*args, **kwargs)
 
     public.__name__ = public.__qualname__ = name
@@ -152,6 +160,8 @@ class device:
 
 
 _CONVERSIONS = (
+    ("half", dtypes.float16),
+    ("bfloat16", dtypes.bfloat16),
     ("float", dtypes.float32),
     ("double", dtypes.float64),
     ("long", dtypes.int64),
@@ -160,11 +170,17 @@ _CONVERSIONS = (
 )
 
 
+def _matrices_turned(x: Tensor) -> Tensor:
+    if x.ndim == 1:
+        raise RuntimeError("tensor.mT is only supported on matrices or batches of matrices. Got 1-D tensor.")
+    return x.transpose(-1, -2) if x.ndim else x
+
+
 def _equip() -> None:
     for name, function in (_BOTH | _found(_METHODS_ONLY)).items():
         if name not in _HIDDEN and name != "where":
             setattr(Tensor, name, _public("Tensor", name, function))
-    for name in _IN_PLACE:
+    for name in _IN_PLACE.split():
         setattr(Tensor, f"{name}_", _public("Tensor", f"{name}_", in_place(_BOTH[name], f"{name}_")))
     methods: dict[str, Any] = {
         "copy_": lambda self, source: self.write(source),
@@ -187,9 +203,9 @@ def _equip() -> None:
         methods[method] = lambda self, _kind=kind: self.to(_kind)
     for name, method in methods.items():
         setattr(Tensor, name, _public("Tensor", name, method))
-    Tensor.device = property(lambda self: device("cpu"))  # type: ignore[attr-defined]
-    Tensor.T = property(lambda self: self.permute(*reversed(range(self.ndim))))  # type: ignore[attr-defined]
-    Tensor.mT = property(lambda self: self.transpose(-1, -2))  # type: ignore[attr-defined]
+    setattr(Tensor, "device", property(lambda self: device("cpu")))  # noqa: B010  # mypy knows no other way
+    setattr(Tensor, "T", property(lambda self: self.permute(*reversed(range(self.ndim)))))  # noqa: B010  # mypy knows no other way
+    setattr(Tensor, "mT", property(_matrices_turned))  # noqa: B010  # mypy knows no other way
     _equip_operators()
 
 
@@ -208,7 +224,7 @@ def _equip_operators() -> None:
         setattr(Tensor, f"__{name}__", _operator(entrywise.COMPARING[name]))
     for name in ("neg", "abs"):
         setattr(Tensor, f"__{name}__", _BOTH[name])
-    setattr(Tensor, "__invert__", entrywise.bitwise_not)  # noqa: B010  # mypy knows no other way
+    setattr(Tensor, "__invert__", entrywise.bitwise_not)  # noqa: B010
     setattr(Tensor, "__pos__", lambda self: self)  # noqa: B010
 
 
@@ -246,7 +262,7 @@ TORCH: dict[str, Any] = {
     "is_grad_enabled": autograd.is_recording,
     "Generator": Generator,
     "result_type": dtypes.result_type,
-    "promote_types": lambda type1, type2: max(type1, type2, key=lambda kind: kind.rank),
+    "promote_types": dtypes.promoted,
     "broadcast_shapes": lambda *shapes: Size(broadcast_shapes(*shapes)),
     "is_tensor": lambda obj: isinstance(obj, Tensor),
     "is_floating_point": lambda input: input.is_floating_point(),

@@ -6,6 +6,8 @@ import operator
 from typing import Any
 
 from .making import make, need_tensor, record
+from .missing import Missing
+from .reductions import root_or_zero
 from .shapes import broadcast_shapes, count
 from .tensor import Tensor
 
@@ -21,16 +23,24 @@ def matmul(input: Tensor, other: Tensor) -> Tensor:
     if a.shape[-1] != b.shape[-2]:
         if input.ndim == other.ndim == 1:
             raise RuntimeError(
-                f"inconsistent tensor size, expected tensor [{input.shape[0]}] and src [{other.shape[0]}] to have the same number of elements,"
-                f" but got {input.shape[0]} and {other.shape[0]} elements respectively"
+                f"inconsistent tensor size, expected tensor [{input.shape[0]}] and src [{other.shape[0]}] to have the same number of"
+                f" elements, but got {input.shape[0]} and {other.shape[0]} elements respectively"
             )
         if other.ndim == 1:
             raise RuntimeError(
                 f"size mismatch, got input ({a.shape[-2]}), mat ({a.shape[-2]}x{a.shape[-1]}), vec ({b.shape[-2]})"
             )
+        if min(input.ndim, other.ndim) > 2:
+            number = count(broadcast_shapes(a.shape[:-2], b.shape[:-2]))
+            raise RuntimeError(
+                f"Expected size for first two dimensions of batch2 tensor to be: [{number}, {a.shape[-1]}] but got: [{number},"
+                f" {b.shape[-2]}]."
+            )
         raise RuntimeError(
             f"mat1 and mat2 shapes cannot be multiplied ({a.shape[-2]}x{a.shape[-1]} and {b.shape[-2]}x{b.shape[-1]})"
         )
+    if input.dtype.category == 0:
+        raise NotImplementedError(f"\"addmm_impl_cpu_\" not implemented for '{input.dtype.long_name}'")
     batch = broadcast_shapes(a.shape[:-2], b.shape[:-2])
     result = _batched(a.expand(*batch, *a.shape[-2:]), b.expand(*batch, *b.shape[-2:]))
     if input.ndim == 1:
@@ -70,6 +80,9 @@ def _batched(a: Tensor, b: Tensor) -> Tensor:
 
 
 def mm(input: Tensor, mat2: Tensor) -> Tensor:
+    for name, x in (("self", input), ("mat2", mat2)):
+        if x.ndim != 2:
+            raise RuntimeError(f"{name} must be a matrix")
     return matmul(input, mat2)
 
 
@@ -80,6 +93,9 @@ def dot(input: Tensor, other: Tensor) -> Tensor:
 
 
 def outer(input: Tensor, vec2: Tensor) -> Tensor:
+    for name, x in (("self", input), ("vec2", vec2)):
+        if x.ndim != 1:
+            raise RuntimeError(f"outer: Expected 1-D argument {name}, but got {x.ndim}-D")
     return input.unsqueeze(1) * vec2.unsqueeze(0)
 
 
@@ -100,8 +116,26 @@ def mv(input: Tensor, vec: Tensor) -> Tensor:
 
 
 def inner(input: Tensor, other: Tensor) -> Tensor:
-    return matmul(input, other.transpose(-1, -2) if other.ndim > 1 else other) if input.ndim and other.ndim else input * other
+    if not input.ndim or not other.ndim:
+        return input * other
+    if input.shape[-1] != other.shape[-1]:
+        raise RuntimeError(
+            f"inner() the last dimension must match on both input tensors but got shapes {list(input.shape)} and {list(other.shape)}"
+        )
+    rows = matmul(input.reshape(-1, input.shape[-1]), other.reshape(-1, other.shape[-1]).t())
+    return rows.reshape(*input.shape[:-1], *other.shape[:-1])
 
 
 def addmm_(input: Tensor, mat1: Tensor, mat2: Tensor, *, beta: float = 1, alpha: float = 1) -> Tensor:
     return beta * input + alpha * mm(mat1, mat2)
+
+
+def cdist(x1: Tensor, x2: Tensor, p: float = 2.0, compute_mode: str = "") -> Tensor:
+    if p != 2:
+        raise Missing(f"torch.cdist with p={p}")
+    for number, x in ((1, x1), (2, x2)):
+        if x.ndim < 2:
+            raise RuntimeError(f"cdist only supports at least 2D tensors, X{number} got: {x.ndim}D")
+    if x1.dtype is not x2.dtype:
+        raise RuntimeError(f"expected scalar type {x2.dtype.long_name} but found {x1.dtype.long_name}")
+    return root_or_zero(((x1.unsqueeze(-2) - x2.unsqueeze(-3)) ** 2).sum(-1))

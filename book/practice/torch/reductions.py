@@ -16,14 +16,14 @@ from .moving import picked
 from .shapes import axes_of, axis_of, count, positions, strides_of
 from .tensor import Storage, Tensor
 
-VALUES_AND_PLACES = {
+VALUES_AND_PLACES: dict[str, Any] = {
     name: namedtuple(name, ["values", "indices"])
     for name in ("min", "max", "sort", "topk", "cummax", "median", "kthvalue", "cummin")
 }
 VALUES_AND_PLACES["aminmax"] = namedtuple("aminmax", ["min", "max"])
 
 
-def groups_of(x: Tensor, axes: Sequence[int]) -> tuple[list[list[Any]], list[Sequence[int]], tuple[int, ...]]:
+def groups_of(x: Tensor, axes: Sequence[int]) -> tuple[list[list[Any]], list[list[int]], tuple[int, ...]]:
     """The entries that are taken together, the places in reading order where they stand, and the shape with 1 along `axes`."""
     strides = strides_of(x.shape)
     kept = [1 if axis in axes else size for axis, size in enumerate(x.shape)]
@@ -75,7 +75,8 @@ def sum_(input: Tensor, dim: Any = None, keepdim: bool = False, *, dtype: Any = 
 def _floats_only(name: str, x: Tensor) -> None:
     if not x.dtype.is_floating_point:
         raise RuntimeError(
-            f"{name}(): could not infer output dtype. Input dtype must be either a floating point or complex dtype. Got: {x.dtype.long_name}"
+            f"{name}(): could not infer output dtype. Input dtype must be either a floating point or complex dtype. Got:"
+            f" {x.dtype.long_name}"
         )
 
 
@@ -83,14 +84,23 @@ def mean(input: Tensor, dim: Any = None, keepdim: bool = False, *, dtype: Any = 
     x = input.to(dtype) if dtype else input
     _floats_only("mean", x)
     return _reduce(
-        "Mean", x, dim, keepdim, lambda v: divide(_total(v), len(v)), x.dtype, lambda group, y: [1 / len(group)] * len(group)
+        "Mean",
+        x,
+        dim,
+        keepdim,
+        lambda v: divide(_total(v), len(v)),
+        x.dtype,
+        lambda group, y: [divide(1.0, len(group))] * len(group),
     )
 
 
 def norm(input: Tensor, p: Any = 2, dim: Any = None, keepdim: bool = False) -> Tensor:
     if p not in (2, "fro", None):
         raise Missing(f"torch.norm with p={p!r}")
-    return _root_or_zero(sum_(input * input, dim, keepdim))
+    if not input.dtype.is_floating_point:
+        kind = input.dtype.long_name
+        raise RuntimeError(f"linalg.vector_norm: Expected a floating point or complex tensor as input. Got {kind}")
+    return root_or_zero(sum_(input * input, dim, keepdim))
 
 
 def nansum(input: Tensor, dim: Any = None, keepdim: bool = False) -> Tensor:
@@ -98,6 +108,9 @@ def nansum(input: Tensor, dim: Any = None, keepdim: bool = False) -> Tensor:
 
 
 def nanmean(input: Tensor, dim: Any = None, keepdim: bool = False) -> Tensor:
+    if not input.dtype.is_floating_point:
+        kind = input.dtype.long_name
+        raise RuntimeError(f"nanmean(): expected input to have floating point or complex dtype but got {kind}")
     kept = ~OF_ONE["isnan"](input)
     return nansum(input, dim, keepdim) / sum_(kept, dim, keepdim)
 
@@ -120,19 +133,21 @@ def var(input: Tensor, dim: Any = None, unbiased: Any = None, keepdim: bool = Fa
         return divide(_total([(v - centre) ** 2 for v in values]), max(len(values) - less, 0))
 
     def slopes(group: list[float], y: float) -> list[float]:
-        centre = _total(group) / len(group)
+        centre = divide(_total(group), len(group))
         return [divide(2 * (v - centre), max(len(group) - less, 0)) for v in group]
 
     return _reduce("Var", input, dim, keepdim, compute, input.dtype, slopes)
 
 
 def std(input: Tensor, dim: Any = None, unbiased: Any = None, keepdim: bool = False, *, correction: Any = None) -> Tensor:
-    return _root_or_zero(var(input, dim, unbiased, keepdim, correction=correction))
+    return root_or_zero(var(input, dim, unbiased, keepdim, correction=correction))
 
 
-def _root_or_zero(variance: Tensor) -> Tensor:
+def root_or_zero(variance: Tensor) -> Tensor:
     """The deviation, whose derivative is taken as 0 where nothing deviates."""
-    return entrywise("std", guarded(math.sqrt), [lambda x, y: 0.5 / y if y > 0 else 0.0 if y == 0 else nan], [variance], keeps="result")
+    return entrywise(
+        "std", guarded(math.sqrt), [lambda x, y: 0.5 / y if y > 0 else 0.0 if y == 0 else nan], [variance], keeps="result"
+    )
 
 
 def var_mean(
@@ -193,11 +208,8 @@ def _extreme(name: str, better: Callable, pairwise: Callable) -> Callable:
     def function(input: Tensor, dim: Any = None, keepdim: bool = False, *, other: Any = None) -> Any:
         if isinstance(dim, Tensor) or other is not None:
             return pairwise(input, dim if other is None else other)
+        _not_of_nothing(name, input, dim)
         if dim is None:
-            if not count(input.shape):
-                raise RuntimeError(
-                    f"{name}(): Expected reduction dim to be specified for input.numel() == 0. Specify the reduction dim with the 'dim' argument."
-                )
             return extremes(input, (), False, better)
         return VALUES_AND_PLACES[name](*chosen(name, input, dim, keepdim, lambda v: _best(v, better)))
 
@@ -218,22 +230,40 @@ max_ = _extreme("max", operator.gt, maximum)
 min_ = _extreme("min", operator.lt, minimum)
 
 
+def _not_of_nothing(name: str, x: Tensor, dim: Any) -> None:
+    """Refuse to choose among no entries."""
+    if count(x.shape) or not x.ndim:
+        return
+    if dim is None or dim == ():
+        hint = "" if name.startswith("arg") else " Specify the reduction dim with the 'dim' argument."
+        error = IndexError if name.startswith("arg") else RuntimeError
+        raise error(f"{name}(): Expected reduction dim to be specified for input.numel() == 0.{hint}")
+    for axis in axes_of(dim, x.ndim):
+        if not x.shape[axis]:
+            raise IndexError(f"{name}(): Expected reduction dim {axis} to have non-zero size.")
+
+
 def amax(input: Tensor, dim: Any = (), keepdim: bool = False) -> Tensor:
+    _not_of_nothing("amax", input, dim)
     return extremes(input, dim, keepdim, operator.gt)
 
 
 def amin(input: Tensor, dim: Any = (), keepdim: bool = False) -> Tensor:
+    _not_of_nothing("amin", input, dim)
     return extremes(input, dim, keepdim, operator.lt)
 
 
-def _arg(better: Callable) -> Callable:
+def _arg(name: str, better: Callable) -> Callable:
     def function(input: Tensor, dim: int | None = None, keepdim: bool = False) -> Tensor:
+        if input.dtype is dtypes.bool_:
+            raise RuntimeError(f"{name}(): does not support bool input")
+        _not_of_nothing(name, input, dim)
         return _reduce("arg", input, dim, keepdim, lambda v: _best(v, better), dtypes.int64)
 
     return function
 
 
-argmax, argmin = _arg(operator.gt), _arg(operator.lt)
+argmax, argmin = _arg("argmax", operator.gt), _arg("argmin", operator.lt)
 
 
 def logsumexp(input: Tensor, dim: Any, keepdim: bool = False) -> Tensor:
@@ -254,9 +284,12 @@ def aminmax(input: Tensor, *, dim: Any = None, keepdim: bool = False) -> Any:
 
 def cov(input: Tensor, *, correction: int = 1) -> Tensor:
     x = input.unsqueeze(0) if input.ndim < 2 else input
+    x = x.unsqueeze(0) if x.ndim < 2 else x
+    x = x if x.dtype.is_floating_point else x.to(dtypes.float32)
+    if x.ndim > 2:
+        raise RuntimeError(f"cov(): expected input to have two or fewer dimensions but got an input with {x.ndim} dimensions")
     deviation = x - mean(x, 1, True)
-    result = deviation @ deviation.t() / max(x.shape[1] - correction, 0)
-    return result if input.ndim == 2 else result.reshape(())
+    return (deviation @ deviation.t() / max(x.shape[1] - correction, 0)).squeeze()
 
 
 def corrcoef(input: Tensor) -> Tensor:

@@ -8,9 +8,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from . import dtypes
+from .entrywise import exponential, floats_only, lerp, log_add_exp
 from .making import inf, make, nan, record, tensor, tensor_like
 from .missing import Missing
-from .moving import picked, index_select, stack
+from .moving import index_select, picked, stack
 from .reductions import VALUES_AND_PLACES, chosen, groups_of, sum_kind
 from .shapes import axis_of, count
 from .tensor import Tensor
@@ -18,14 +19,24 @@ from .tensor import Tensor
 
 def median(input: Tensor, dim: Any = None, keepdim: bool = False) -> Any:
     def which(values: list[Any]) -> int:
+        if any(value != value for value in values):
+            return next(i for i, value in enumerate(values) if value != value)
         return sorted(range(len(values)), key=values.__getitem__)[(len(values) - 1) // 2]
 
+    if input.dtype is dtypes.bool_:
+        raise NotImplementedError("\"median_cpu\" not implemented for 'Bool'")
+    if dim is None and not count(input.shape):
+        return make([nan if input.dtype.is_floating_point else -(2**63)], (), input.dtype)
     if dim is None:
         return chosen("median", input.reshape(-1), 0, False, which)[0]
     return VALUES_AND_PLACES["median"](*chosen("median", input, dim, keepdim, which))
 
 
 def quantile(input: Tensor, q: Any, dim: Any = None, keepdim: bool = False) -> Tensor:
+    if input.dtype not in (dtypes.float32, dtypes.float64):
+        raise RuntimeError("quantile() input tensor must be either float or double dtype")
+    if not count(input.shape):
+        raise RuntimeError("quantile() input tensor must be non-empty")
     levels = tensor_like(q, input.dtype)
     parts = [_quantile(input, level, dim, keepdim) for level in levels.reshape(-1).tolist()]
     return stack(parts) if levels.ndim else parts[0]
@@ -37,7 +48,7 @@ def _quantile(x: Tensor, level: float, dim: Any, keepdim: bool) -> Tensor:
     at = level * (x.shape[axis_of(dim, x.ndim)] - 1)
     low, high = math.floor(at), math.ceil(at)
     parts = [index_select(ordered, dim, tensor([i])) for i in (low, high)]
-    result = parts[0] + (parts[1] - parts[0]) * (at - low)
+    result = lerp(parts[0], parts[1], at - low)
     return result if keepdim else result.squeeze(dim)
 
 
@@ -62,7 +73,11 @@ def _along(name: str, x: Tensor, axis: int, compute: Callable, send: Callable | 
         arriving = gradient.flat()
         return [
             arranged(
-                [send([arriving[p] for p in where_], group, row) for where_, group, row in zip(places, groups, rows, strict=True)], x.dtype
+                [
+                    send([arriving[p] for p in where_], group, row)
+                    for where_, group, row in zip(places, groups, rows, strict=True)
+                ],
+                x.dtype,
             )
         ]
 
@@ -70,9 +85,12 @@ def _along(name: str, x: Tensor, axis: int, compute: Callable, send: Callable | 
     return record(result, f"{name}Backward0", [x], send_back, keeps)
 
 
-def _float_rows(name: str, x: Tensor, dtype: Any) -> Tensor:
+def _float_rows(name: str, x: Tensor, dim: int, dtype: Any) -> Tensor:
     x = x.to(dtype) if dtype else x
     if not x.dtype.is_floating_point:
+        axis_of(dim, x.ndim)
+        if not count(x.shape):
+            return x
         raise NotImplementedError(f"\"{name}_lastdim_kernel_impl\" not implemented for '{x.dtype.long_name}'")
     return x
 
@@ -81,12 +99,12 @@ def _log_softmax_row(row: list[float]) -> list[float]:
     top = max(row, default=0.0)
     if abs(top) == inf or any(v != v for v in row):
         return [nan] * len(row)
-    total = math.log(math.fsum(math.exp(v - top) for v in row))
+    total = math.log(math.fsum(math.exp(v - top) for v in row)) if row else 0.0
     return [v - top - total for v in row]
 
 
 def log_softmax(input: Tensor, dim: int, *, dtype: Any = None) -> Tensor:
-    x = _float_rows("log_softmax", input, dtype)
+    x = _float_rows("log_softmax", input, dim, dtype)
 
     def send(g: list[float], row: list[float], out: list[float]) -> list[float]:
         total = sum(g)
@@ -96,7 +114,7 @@ def log_softmax(input: Tensor, dim: int, *, dtype: Any = None) -> Tensor:
 
 
 def softmax(input: Tensor, dim: int, *, dtype: Any = None) -> Tensor:
-    x = _float_rows("softmax", input, dtype)
+    x = _float_rows("softmax", input, dim, dtype)
 
     def send(g: list[float], row: list[float], out: list[float]) -> list[float]:
         total = sum(a * b for a, b in zip(g, out, strict=True))
@@ -129,9 +147,16 @@ def cumprod(input: Tensor, dim: int, *, dtype: Any = None) -> Tensor:
     return _along("Cumprod", input, dim, lambda row: _running(row, operator.mul), send, sum_kind(input, dtype))
 
 
+def _rank(value: Any, descending: bool = False) -> tuple[bool, Any]:
+    """What to sort by: what is no number counts as the largest."""
+    if value != value:
+        return (not descending, 0.0)
+    return (descending, -value) if descending else (False, value)
+
+
 def argsort(input: Tensor, dim: int = -1, descending: bool = False, stable: bool = True) -> Tensor:
     def order(row: list[Any]) -> list[int]:
-        return sorted(range(len(row)), key=lambda i: -row[i] if descending else row[i])
+        return sorted(range(len(row)), key=lambda i: _rank(row[i], descending))
 
     return _along("sort", input, dim, order, None, dtypes.int64)
 
@@ -142,12 +167,22 @@ def sort(input: Tensor, dim: int = -1, descending: bool = False, stable: bool = 
 
 
 def topk(input: Tensor, k: int, dim: int = -1, largest: bool = True, sorted: bool = True) -> Any:
-    indices = argsort(input, dim, largest).narrow(dim, 0, k)
+    length = input.shape[axis_of(dim, input.ndim)] if input.ndim else 1
+    if not 0 <= k <= length:
+        raise RuntimeError("selected index k out of range")
+    if input.dtype is dtypes.bool_:
+        raise RuntimeError("topk does not support bool dtypes on CPU")
+    indices = argsort(input, dim, largest)
+    indices = indices.narrow(dim, 0, k) if input.ndim else indices
     return VALUES_AND_PLACES["topk"](picked(input, dim, indices), indices)
 
 
 def diff(input: Tensor, n: int = 1, dim: int = -1) -> Tensor:
+    if not input.ndim:
+        raise RuntimeError("diff expects input to be at least one-dimensional")
     length = input.shape[axis_of(dim, input.ndim)]
+    if not length:
+        return input.clone()
     later, earlier = input.narrow(dim, 1, length - 1), input.narrow(dim, 0, length - 1)
     result = later != earlier if input.dtype is dtypes.bool_ else later - earlier
     return result if n == 1 else diff(result, n - 1, dim)
@@ -176,13 +211,17 @@ cummax, cummin = _cumulative("cummax", operator.ge), _cumulative("cummin", opera
 
 
 def logcumsumexp(input: Tensor, dim: int) -> Tensor:
-    top = input.detach().amax(dim, True)
-    return cumsum((input - top).exp(), dim).log() + top
+    floats_only("logcumsumexp_out_cpu", input.dtype)
+
+    def send(g: list[float], row: list[float], out: list[float]) -> list[float]:
+        return [sum(g[j] * exponential(x - out[j]) for j in range(i, len(row))) for i, x in enumerate(row)]
+
+    return _along("Logcumsumexp", input, dim, lambda row: _running(row, log_add_exp), send, input.dtype)
 
 
 def kthvalue(input: Tensor, k: int, dim: int = -1, keepdim: bool = False) -> Any:
     def which(values: list[Any]) -> int:
-        return sorted(range(len(values)), key=values.__getitem__)[k - 1]
+        return sorted(range(len(values)), key=lambda i: _rank(values[i]))[k - 1]
 
     return VALUES_AND_PLACES["kthvalue"](*chosen("kthvalue", input, dim, keepdim, which))
 
@@ -191,6 +230,8 @@ def bincount(input: Tensor, weights: Any = None, minlength: int = 0) -> Tensor:
     if weights is not None:
         raise Missing("torch.bincount with weights=")
     entries = input.flat()
+    if input.ndim != 1 or input.dtype.category != 1 or min(entries, default=0) < 0:
+        raise RuntimeError("bincount only supports 1-d non-negative integral inputs.")
     return make(
         [entries.count(i) for i in range(max(minlength, max(entries, default=-1) + 1))],
         (max(minlength, max(entries, default=-1) + 1),),

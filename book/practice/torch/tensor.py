@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from . import dtypes
 from .autograd import Leaf, Node, accumulate, is_recording
@@ -49,6 +49,35 @@ class Tensor:
         self.base: Tensor | None = None
         self._base_step: Node | None = None
 
+    if TYPE_CHECKING:  # `names` gives tensors their operators
+
+        def __add__(self, other: Any) -> Tensor: ...
+        def __radd__(self, other: Any) -> Tensor: ...
+        def __sub__(self, other: Any) -> Tensor: ...
+        def __rsub__(self, other: Any) -> Tensor: ...
+        def __mul__(self, other: Any) -> Tensor: ...
+        def __rmul__(self, other: Any) -> Tensor: ...
+        def __truediv__(self, other: Any) -> Tensor: ...
+        def __rtruediv__(self, other: Any) -> Tensor: ...
+        def __pow__(self, other: Any) -> Tensor: ...
+        def __rpow__(self, other: Any) -> Tensor: ...
+        def __matmul__(self, other: Any) -> Tensor: ...
+        def __rmatmul__(self, other: Any) -> Tensor: ...
+        def __and__(self, other: Any) -> Tensor: ...
+        def __rand__(self, other: Any) -> Tensor: ...
+        def __or__(self, other: Any) -> Tensor: ...
+        def __ror__(self, other: Any) -> Tensor: ...
+        def __xor__(self, other: Any) -> Tensor: ...
+        def __rxor__(self, other: Any) -> Tensor: ...
+        def __lt__(self, other: Any) -> Tensor: ...
+        def __le__(self, other: Any) -> Tensor: ...
+        def __gt__(self, other: Any) -> Tensor: ...
+        def __ge__(self, other: Any) -> Tensor: ...
+        def __eq__(self, other: Any) -> Tensor: ...  # type: ignore[override]
+        def __ne__(self, other: Any) -> Tensor: ...  # type: ignore[override]
+        def __neg__(self) -> Tensor: ...
+        def __invert__(self) -> Tensor: ...
+
     def __getattr__(self, name: str) -> Any:
         raise missing("Tensor", name)
 
@@ -77,28 +106,32 @@ class Tensor:
         return self.step if self.step is not None and not isinstance(self.step, Leaf) else None
 
     @property
-    def device(self) -> str:
-        return "cpu"
-
-    @property
     def is_cuda(self) -> bool:
         return False
 
     @property
     def data(self) -> Tensor:
-        return self.detach()
+        """The same numbers, whose changes nobody notices."""
+        return Tensor(Storage(self.storage.numbers), self.shape, self.dtype, self.strides, self.offset)
 
     def is_floating_point(self) -> bool:
         return self.dtype.is_floating_point
 
     def is_contiguous(self) -> bool:
-        return all(size == 1 or stride == want for size, stride, want in zip(self.shape, self.strides, strides_of(self.shape), strict=True))
+        return all(
+            size == 1 or stride == want
+            for size, stride, want in zip(self.shape, self.strides, strides_of(self.shape), strict=True)
+        )
 
     def flat(self) -> list[Any]:
         """The entries in reading order."""
         if self.is_contiguous():
             return self.storage.numbers[self.offset : self.offset + count(self.shape)]
         return list(map(self.storage.numbers.__getitem__, positions(self.shape, self.strides, self.offset)))
+
+    def places(self) -> list[int]:
+        """Where the entries lie in the row."""
+        return positions(self.shape, self.strides, self.offset)
 
     def item(self) -> Any:
         if count(self.shape) != 1:
@@ -239,6 +272,17 @@ class Tensor:
             return
         places, shape = view._picked(rest)
         value = _tensor_of(value, self.dtype)
+        if value.dtype is not self.dtype and value.ndim:
+            raise RuntimeError(
+                f"Index put requires the source and destination dtypes match, got {self.dtype.long_name} for the destination and"
+                f" {value.dtype.long_name} for the source."
+            )
+        if value.storage.numbers is self.storage.numbers and set(value.places()) & set(self.places()):
+            raise RuntimeError(ONE_LOCATION)
+        if not _fits(value.shape, shape):
+            raise RuntimeError(
+                f"shape mismatch: value tensor of shape {list(value.shape)} cannot be broadcast to indexing result of shape {list(shape)}"
+            )
         numbers = spread(value, shape)
         view._write_places(places, shape, value, numbers)
 
@@ -246,24 +290,34 @@ class Tensor:
         """The view that the integers, slices and None of an index give; and, for each of its axes, the tensor that picks there or None."""
         entries = list(index) if isinstance(index, tuple) else [index]
         entries = [_as_index(entry) for entry in entries]
-        used = sum(entry.ndim if _is_mask(entry) else 1 for entry in entries if entry is not None and entry is not Ellipsis)
+        used = sum(
+            0 if _is_truth_value(entry) else entry.ndim if _is_mask(entry) else 1
+            for entry in entries
+            if entry is not None and entry is not Ellipsis
+        )
         if used > self.ndim:
+            if not self.ndim and not isinstance(index, tuple):
+                _no_parts_of_a_number(index)
             raise IndexError(f"too many indices for tensor of dimension {self.ndim}")
         at = next((i for i, entry in enumerate(entries) if entry is Ellipsis), len(entries))
         full = [slice(None)] * (self.ndim - used)
-        entries = entries[:at] + full + [entry for entry in entries[at + 1 :]]
+        entries = entries[:at] + full + entries[at + 1 :]
         shape, strides, offset, axis = [], [], self.offset, 0
         picks: list[Any] = []
         for entry in entries:
-            if entry is None:
-                shape.append(1), strides.append(0), picks.append(None)
+            if entry is None or _is_truth_value(entry):
+                shape.append(1)
+                strides.append(0)
+                picks.append(None if entry is None else from_nested([0] if entry.item() else [], dtypes.int64))
                 continue
             size, stride = self.shape[axis], self.strides[axis]
             if isinstance(entry, slice):
                 first, last, by = entry.indices(size)
                 if by < 1:
                     raise ValueError("step must be greater than zero")
-                shape.append(len(range(first, last, by))), strides.append(stride * by), picks.append(None)
+                shape.append(len(range(first, last, by)))
+                strides.append(stride * by)
+                picks.append(None)
                 offset += first * stride if shape[-1] else 0
             elif isinstance(entry, int):
                 if not -size <= entry < size:
@@ -300,7 +354,9 @@ class Tensor:
         others = [axis for axis in range(self.ndim) if axis not in axes]
         before = [axis for axis in others if axis < first]
         after = [axis for axis in others if axis >= first]
-        jumps = [sum(i * self.strides[axis] for i, axis in zip(tuple_, axes, strict=True)) for tuple_ in zip(*chosen, strict=False)]
+        jumps = [
+            sum(i * self.strides[axis] for i, axis in zip(tuple_, axes, strict=True)) for tuple_ in zip(*chosen, strict=False)
+        ]
         lead = positions([self.shape[axis] for axis in before], [self.strides[axis] for axis in before], self.offset)
         tail = positions([self.shape[axis] for axis in after], [self.strides[axis] for axis in after], 0)
         places = [a + b + c for a in lead for b in jumps for c in tail]
@@ -324,6 +380,13 @@ class Tensor:
     def write(self, value: Any) -> Tensor:
         """Put these numbers in place of the tensor's own, with their graph."""
         value = _tensor_of(value, self.dtype)
+        if value is not self and value.storage.numbers is self.storage.numbers and _meet_halfway(self, value):
+            raise RuntimeError(ONE_LOCATION)
+        if any(size > 1 and not stride for size, stride in zip(self.shape, self.strides, strict=True)):
+            raise RuntimeError(
+                "unsupported operation: more than one element of the written-to tensor refers to a single memory location. Please"
+                " clone() the tensor before performing the operation."
+            )
         self._write_places(positions(self.shape, self.strides, self.offset), self.shape, value, spread(value, self.shape))
         return self
 
@@ -355,7 +418,7 @@ class Tensor:
                 kept[place] = 0.0
             return Tensor(Storage(kept), gradient.shape, gradient.dtype), sum_to(to_value, value.shape)
 
-        owner.step = Node("CopySlices", (owner, value), send_back)
+        owner.step = Node("torch::autograd::CopySlices", (owner, value), send_back)
         owner.requires_grad = True
         if owner is not self:
             self.requires_grad = True
@@ -368,7 +431,10 @@ class Tensor:
 def spread_strides(tensor: Tensor, shape: Sequence[int]) -> tuple[int, ...]:
     """Strides with which a tensor has this larger shape: 0 along the axes that it lacks."""
     lacking = len(shape) - tensor.ndim
-    own = [0 if size == 1 and want != 1 else stride for size, stride, want in zip(tensor.shape, tensor.strides, shape[lacking:], strict=True)]
+    own = [
+        0 if size == 1 and want != 1 else stride
+        for size, stride, want in zip(tensor.shape, tensor.strides, shape[lacking:], strict=True)
+    ]
     return (*[0] * lacking, *own)
 
 
@@ -380,12 +446,17 @@ def spread(tensor: Tensor, shape: Sequence[int]) -> list[Any]:
     while len(sizes) > len(shape) and sizes[0] == 1:  # a single row, written to a vector
         sizes, strides = sizes[1:], strides[1:]
     lead = len(shape) - len(sizes)
+    if lead < 0:
+        raise RuntimeError(
+            f"expand(torch.{tensor.dtype.long_name}Tensor{{{sizes}}}, size={list(shape)}): the number of sizes provided ({len(shape)}) must"
+            f" be greater or equal to the number of dimensions in the tensor ({len(sizes)})"
+        )
     for axis, size in enumerate(sizes):
-        want = shape[lead + axis] if lead + axis >= 0 else 0
+        want = shape[lead + axis]
         if size not in (1, want):
             raise RuntimeError(
                 f"The expanded size of the tensor ({want}) must match the existing size ({size}) at non-singleton dimension"
-                f" {max(lead + axis, 0)}.  Target sizes: {list(shape)}.  Tensor sizes: {list(tensor.shape)}"
+                f" {lead + axis}.  Target sizes: {list(shape)}.  Tensor sizes: {sizes}"
             )
     whole = Tensor(tensor.storage, sizes, tensor.dtype, strides, tensor.offset)
     return list(map(whole.storage.numbers.__getitem__, positions(shape, spread_strides(whole, shape), whole.offset)))
@@ -395,6 +466,8 @@ def sum_to(tensor: Tensor, shape: Sequence[int]) -> Tensor:
     """Undo broadcasting: add up along the axes that were spread."""
     if tuple(tensor.shape) == tuple(shape):
         return tensor
+    if tensor.ndim < len(shape):  # a row was written to a vector
+        tensor = Tensor(tensor.storage, (*[1] * (len(shape) - tensor.ndim), *tensor.shape), tensor.dtype)
     numbers = [0.0] * count(shape)
     lead = tensor.ndim - len(shape)
     steps = [0] * lead + [0 if size == 1 else stride for size, stride in zip(shape, strides_of(shape), strict=True)]
@@ -406,13 +479,53 @@ def sum_to(tensor: Tensor, shape: Sequence[int]) -> Tensor:
 # ------------------------------------------------------------------------------------------------------------------- small
 
 
+ONE_LOCATION = (
+    "unsupported operation: some elements of the input tensor and the written-to tensor refer to a single memory location. Please"
+    " clone() the tensor before performing the operation."
+)
+
+
+def _meet_halfway(a: Tensor, b: Tensor) -> bool:
+    """Whether two tensors overlap in the row and are not the same: torch sees it if both lie without gaps."""
+    one, other = a.places(), b.places()
+    if not one or not other or any(max(p) - min(p) + 1 != len(set(p)) for p in (one, other)):
+        return False
+    return one != other and max(min(one), min(other)) <= min(max(one), max(other))
+
+
 def _is_mask(entry: Any) -> bool:
     return isinstance(entry, Tensor) and entry.dtype is dtypes.bool_
 
 
+def _no_parts_of_a_number(index: Any) -> None:
+    if isinstance(index, slice):
+        raise IndexError("slice() cannot be applied to a 0-dim tensor.")
+    if isinstance(index, int) and index == 0:
+        raise IndexError(
+            "invalid index of a 0-dim tensor. Use `tensor.item()` in Python or `tensor.item<T>()` in C++ to convert a 0-dim tensor to a"
+            " number"
+        )
+    if isinstance(index, int):
+        raise IndexError(f"index {index} is out of bounds for dimension 0 with size 0")
+
+
+def _fits(shape: Sequence[int], target: Sequence[int]) -> bool:
+    """Whether a tensor of one shape can be written to one of the other; leading axes of size 1 may be too many."""
+    mine = list(shape)
+    while len(mine) > len(target) and mine[0] == 1:
+        mine = mine[1:]
+    if len(mine) > len(target):
+        return False
+    return all(size in (1, want) for size, want in zip(mine, target[len(target) - len(mine) :], strict=True))
+
+
+def _is_truth_value(entry: Any) -> bool:
+    return _is_mask(entry) and not entry.shape
+
+
 def _as_index(entry: Any) -> Any:
     if isinstance(entry, bool):
-        raise Missing("torch.Tensor with an index of True or False")
+        return from_nested(entry)
     if entry is None or entry is Ellipsis or isinstance(entry, (int, slice)):
         if isinstance(entry, slice):
             return slice(*(None if part is None else part.__index__() for part in (entry.start, entry.stop, entry.step)))

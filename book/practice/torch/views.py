@@ -35,8 +35,8 @@ def view(input: Tensor, *shape: Any) -> Tensor:
     sizes = _with_inferred(sizes_of(shape), count(input.shape))
     if not input.is_contiguous():
         raise RuntimeError(
-            "view size is not compatible with input tensor's size and stride (at least one dimension spans across two contiguous subspaces)."
-            " Use .reshape(...) instead."
+            "view size is not compatible with input tensor's size and stride (at least one dimension spans across two contiguous"
+            " subspaces). Use .reshape(...) instead."
         )
     return view_of(input, sizes, strides_of(sizes))
 
@@ -58,7 +58,15 @@ def squeeze(input: Tensor, dim: Any = None) -> Tensor:
 
 
 def permute(input: Tensor, *dims: Any) -> Tensor:
-    axes = [axis_of(dim, input.ndim) for dim in _flat_arguments(dims)]
+    wanted = _flat_arguments(dims)
+    if len(wanted) != input.ndim:
+        raise RuntimeError(
+            "permute(sparse_coo): number of dimensions in the tensor input does not match the length of the desired ordering of"
+            f" dimensions i.e. input.dim() = {input.ndim} is not equal to len(dims) = {len(wanted)}"
+        )
+    axes = [axis_of(dim, input.ndim) for dim in wanted]
+    if len(set(axes)) < len(axes):
+        raise RuntimeError("permute(): duplicate dims are not allowed.")
     return view_of(input, [input.shape[axis] for axis in axes], [input.strides[axis] for axis in axes])
 
 
@@ -81,6 +89,8 @@ def t(input: Tensor) -> Tensor:
 
 
 def movedim(input: Tensor, source: int, destination: int) -> Tensor:
+    if not input.ndim:
+        return view_of(input, (), ())
     axes = [axis for axis in range(input.ndim) if axis != axis_of(source, input.ndim)]
     axes.insert(axis_of(destination, input.ndim), axis_of(source, input.ndim))
     return permute(input, axes)
@@ -91,8 +101,13 @@ def expand(input: Tensor, *sizes: Any) -> Tensor:
     lead = len(wanted) - input.ndim
     if lead < 0:
         raise RuntimeError(
-            f"expand(torch.{input.dtype.long_name}Tensor{{{list(input.shape)}}}, size={wanted}): the number of sizes provided ({len(wanted)})"
-            f" must be greater or equal to the number of dimensions in the tensor ({input.ndim})"
+            f"expand(torch.{input.dtype.long_name}Tensor{{{list(input.shape)}}}, size={wanted}): the number of sizes provided"
+            f" ({len(wanted)}) must be greater or equal to the number of dimensions in the tensor ({input.ndim})"
+        )
+    if any(size < 0 and not (size == -1 and axis >= lead) for axis, size in enumerate(wanted)):
+        axis = next(axis for axis, size in enumerate(wanted) if size < 0 and not (size == -1 and axis >= lead))
+        raise RuntimeError(
+            f"The expanded size of the tensor ({wanted[axis]}) isn't allowed in a leading, non-existing dimension {axis}"
         )
     shape = [input.shape[axis - lead] if size == -1 and axis >= lead else size for axis, size in enumerate(wanted)]
     for axis, (size, want) in enumerate(zip(input.shape, shape[lead:], strict=True)):
@@ -114,18 +129,31 @@ def broadcast_tensors(*tensors: Tensor) -> tuple[Tensor, ...]:
 
 
 def narrow(input: Tensor, dim: int, start: int, length: int) -> Tensor:
-    return input[(slice(None),) * axis_of(dim, input.ndim) + (slice(start, start + length),)]
+    if not input.ndim:
+        raise RuntimeError("narrow() cannot be applied to a 0-dim tensor.")
+    axis = axis_of(dim, input.ndim)
+    size = input.shape[axis]
+    first = start + size if start < 0 else start
+    if length < 0 or not 0 <= first <= size or first + length > size:
+        raise RuntimeError(f"start ({start}) + length ({length}) exceeds dimension size ({size}).")
+    return input[(slice(None),) * axis + (slice(first, first + length),)]
 
 
 def select(input: Tensor, dim: int, index: int) -> Tensor:
+    if not input.ndim:
+        raise IndexError("select() cannot be applied to a 0-dim tensor.")
     return input[(slice(None),) * axis_of(dim, input.ndim) + (index,)]
 
 
 def unbind(input: Tensor, dim: int = 0) -> tuple[Tensor, ...]:
+    if not input.ndim:
+        raise IndexError("Dimension specified as 0 but tensor has no dimensions")
     return tuple(select(input, dim, i) for i in range(input.shape[axis_of(dim, input.ndim)]))
 
 
 def split(input: Tensor, split_size_or_sections: Any, dim: int = 0) -> tuple[Tensor, ...]:
+    if not input.ndim:
+        raise RuntimeError("split expects at least a 1-dimensional tensor")
     length = input.shape[axis_of(dim, input.ndim)]
     sizes = split_size_or_sections
     if isinstance(sizes, int):
@@ -140,6 +168,8 @@ def split(input: Tensor, split_size_or_sections: Any, dim: int = 0) -> tuple[Ten
 
 
 def chunk(input: Tensor, chunks: int, dim: int = 0) -> tuple[Tensor, ...]:
+    if not input.ndim:
+        raise RuntimeError("chunk expects at least a 1-dimensional tensor")
     return split(input, max(-(-input.shape[axis_of(dim, input.ndim)] // chunks), 1), dim)
 
 

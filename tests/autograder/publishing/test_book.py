@@ -14,7 +14,7 @@ from autograder.authoring import assemble
 from autograder.authoring.chapter import parse
 from autograder.authoring.contract import references
 from autograder.paths import ROOT
-from autograder.publishing import book, execution
+from autograder.publishing import book, execution, practice_page
 
 HOW_TO_PAGES = sorted((ROOT / "book" / "how-to").glob("*.md"))
 
@@ -236,7 +236,7 @@ def test_table_of_contents_comes_from_the_front_matter(tiny):
     assert sorted(f"{entry['file']}.md" for entry in how_to["chapters"]) == [f"how-to/{path.name}" for path in HOW_TO_PAGES]
     assert [entry["file"] for entry in chapters["chapters"]] == ["chapters/ch98_before", "chapters/ch99_tiny"]
     assert chapters["chapters"][1]["title"] == f"99. {tiny.chapter.title}"
-    assert [entry["file"] for entry in appendices["chapters"]] == ["notation", "kill-matrix", "format"]
+    assert [entry["file"] for entry in appendices["chapters"]] == ["notation", "kill-matrix", "practice", "format"]
 
 
 def test_notation_page_has_every_name_and_keeps_bars_inside_their_cells():
@@ -284,6 +284,7 @@ def bare(tiny, tmp_path_factory):
         patch.setattr(book, "executed_outputs", lambda chapter: tiny.outputs if chapter.number == 99 else [])
         patch.setattr(book, "run_all", lambda chapters, first: None)
         patch.setattr(book, "kill_rows", lambda chapter, keys: [])
+        patch.setattr(practice_page, "practice_rows", lambda chapter, keys: [])
         patch.setattr(book, "_build_key", lambda chapters, with_solutions: "tiny")
         patch.setattr(book, "cache_folder", lambda: folder)
         patch.setattr(book, "STAGE", folder / "stage")
@@ -314,6 +315,7 @@ def test_only_pages_and_what_they_show_is_published(bare):
         "index.html",
         "notation.html",
         "kill-matrix.html",
+        "practice.html",
         "format.html",
         "search.html",
         "searchindex.js",
