@@ -337,7 +337,9 @@ def _build_key(chapters: list[Chapter], with_solutions: bool) -> str:
     kept = [*(ROOT / "autograder" / "proving" / "records").rglob("*.json"), ROOT / "requirements.txt", ROOT / "constraints.txt"]
     chapters_own = [chapter.path for chapter in chapters]
     outputs = [execution_key(chapter) for chapter in chapters]
-    return content_hash([str(with_solutions), in_page.fingerprint(), *outputs], [*own, *code, *kept, ROOT / "_config.yml", *chapters_own])
+    return content_hash(
+        [str(with_solutions), in_page.fingerprint(), *outputs], [*own, *code, *kept, ROOT / "_config.yml", *chapters_own]
+    )
 
 
 def _is_current(out: Path, key: str) -> bool:

@@ -85,7 +85,9 @@ class Firefox:
         """What an async function with this body returns in the page; `arguments` are its arguments, by that name."""
         script = f"""const done = arguments[arguments.length - 1], given = [...arguments].slice(0, -1);
             (async (...arguments) => {{ {body} }})(...given).then((value) => done({{value}}), (error) => done({{error: String(error)}}));"""
-        told = self.ask("WebDriver:ExecuteAsyncScript", script=script, args=list(arguments), newSandbox=False, sandbox=None)["value"]
+        told = self.ask("WebDriver:ExecuteAsyncScript", script=script, args=list(arguments), newSandbox=False, sandbox=None)[
+            "value"
+        ]
         if "error" in told:
             raise FirefoxError(told["error"])
         return told.get("value")

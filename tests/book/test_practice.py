@@ -224,12 +224,18 @@ def test_firefox_does_the_same(html, tmp_path, name):
         firefox.run("while (!document.activeElement.classList.contains('cm-content')) await new Promise(requestAnimationFrame)")
         firefox.press("Control+End", "Enter", "Tab", *"# mine")
         firefox.press("Control+Enter")
-        firefox.run("while (!document.querySelector('.tag_exercise-compute_gae .course-check')) await new Promise(requestAnimationFrame)")
-        assert "Not implemented yet: compute_gae" in firefox.run("return document.querySelector('.tag_exercise-compute_gae').innerText")
+        firefox.run(
+            "while (!document.querySelector('.tag_exercise-compute_gae .course-check')) await new Promise(requestAnimationFrame)"
+        )
+        assert "Not implemented yet: compute_gae" in firefox.run(
+            "return document.querySelector('.tag_exercise-compute_gae').innerText"
+        )
         firefox.press("Escape", "Tab")
         assert firefox.run("return document.activeElement.getAttribute('aria-label')") == "Check compute_gae"
         firefox.open(html / f"{PAGE}.html")
-        firefox.run("while (!document.querySelector('.tag_exercise-compute_gae .cm-content')) await new Promise(requestAnimationFrame)")
+        firefox.run(
+            "while (!document.querySelector('.tag_exercise-compute_gae .cm-content')) await new Promise(requestAnimationFrame)"
+        )
         assert "    # mine" in firefox.run("return coursePractice.drafts().compute_gae")
         asked = firefox.run("return performance.getEntriesByType('resource').map((one) => one.name)")
         assert [url for url in asked if not url.startswith(("file:", "blob:", "data:"))] == []
