@@ -39,7 +39,7 @@ window.coursePracticeEditor = ({parent, text, label, help, changed, check}) => {
         keymap.of([...defaultKeymap, ...historyKeymap, indentWithTab]),
         history(), indentOnInput(), bracketMatching(), indentUnit.of("    "),
         pythonLanguage, syntaxHighlighting(colours), look,
-        EditorView.contentAttributes.of({"aria-label": label, "aria-describedby": help}),
+        EditorView.contentAttributes.of({"aria-label": label, "aria-describedby": help, tabindex: "0"}),
         EditorView.updateListener.of((update) => update.docChanged && changed(update.state.doc.toString())),
       ],
     }),

@@ -14,6 +14,8 @@ function element(tag, properties = {}, ...children) {
   return made;
 }
 
+const button = (text, does) => element("button", {type: "button", onclick: does}, text);
+
 const cells = [...document.querySelectorAll('div.cell[class*="tag_exercise-"]')].map((cell) => {
   const name = [...cell.classList].find((one) => one.startsWith("tag_exercise-")).slice("tag_exercise-".length);
   return {cell, name};
@@ -40,7 +42,6 @@ function Answer(cell, name) {
   const stub = code.querySelector("pre").textContent.trimEnd();
   const help = element("p", {className: "practice-help", id: `practice-help-${name}`, hidden: true},
     "Tab indents; Escape, then Tab, leaves the editor; Ctrl or Cmd and Enter checks.");
-  const button = (text, does) => element("button", {type: "button", className: "btn btn-sm btn-outline-primary", onclick: does}, text);
   const write = button("Write your answer", () => open(true));
   const tried = button("Check", () => judge());
   const halt = button("Stop", () => stop());
@@ -124,7 +125,6 @@ const summary = element("span");
 const said = element("p", {role: "status", className: "practice-said"});
 
 if (answers.size) {
-  const button = (text, does) => element("button", {type: "button", className: "btn btn-sm btn-outline-primary", onclick: does}, text);
   const file = element("input", {type: "file", accept: "application/json,.json", hidden: true, tabIndex: -1, onchange: () => load(file)});
   file.setAttribute("aria-label", "A file with drafts");
   const panel = element("div", {className: "practice-panel"},
