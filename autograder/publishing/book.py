@@ -289,7 +289,7 @@ class Renderer:
     def render(self, stage: Path, work: Path, chapters: list[Chapter]) -> None:
         """Build `stage` into `work`. Raises: BookError with every warning, told of the sources of these chapters."""
         options = ["--config", str(ROOT / "_config.yml"), "--path-output", str(work), "-W", "-n", "--keep-going", "-q"]
-        _rewrite_pages_of_other_assets(stage, work / "_build" / "html" / ".buildinfo")
+        _rewrite_pages_of_other_assets(stage / "vendor", work / "_build" / "html")
         _, complaints = self._process.communicate(json.dumps(["build", str(stage), *options]))
         if self._process.returncode != 0:
             shutil.rmtree(work, ignore_errors=True)  # Sphinx would not repeat a warning about a page that it has read already
@@ -306,10 +306,14 @@ class Renderer:
             self._process.communicate()
 
 
-def _rewrite_pages_of_other_assets(stage: Path, seal: Path) -> None:
-    """Sphinx copies style sheets and scripts only where a page is written, and pages name their checksums; without `seal` it writes all."""
-    if seal.exists() and any(path.stat().st_mtime > seal.stat().st_mtime for path in (stage / "vendor").rglob("*")):
-        seal.unlink()
+def _rewrite_pages_of_other_assets(assets: Path, html: Path) -> None:
+    """Make Sphinx write all pages if an asset is newer than one of them: it copies assets only where it writes, and pages name their
+    checksums."""
+    pages = list(html.rglob("*.html"))
+    newest = max((path.stat().st_mtime for path in assets.rglob("*")), default=0)
+    if any(page.stat().st_mtime < newest for page in pages):
+        for page in pages:
+            os.utime(page, (0, 0))
 
 
 def publish(html: Path, out: Path) -> None:
