@@ -310,7 +310,7 @@ def _judged_on_pages(only: Sequence[str], every: bool) -> int:
     from autograder.proving import practice
 
     keys, proved = practice.Keys(), 0
-    for assignment in only or checks.assignments():
+    for assignment in [name for name in only or checks.assignments() if practice.has_page(name)]:
         for one in practice.prove(assignment, every, keys):
             err.print(f"{assignment} {one.exercise}, on its page: {one.reason or 'offered'}", markup=False)
             proved += 1

@@ -50,6 +50,11 @@ def files() -> dict[str, Path]:
     return own | {f"course_lib/{name}": COURSE_LIB / name for name in LIBRARY}
 
 
+def has_page(assignment: str) -> bool:
+    """Whether there is a chapter to these checks yet."""
+    return int(assignment.removeprefix("ch")) in chapters.page_files()
+
+
 def page_of(chapter: Chapter, offered: Iterable[str] | None = None) -> str:
     """What a chapter's page hands to `judge.open_page`, as text.
 

@@ -30,6 +30,7 @@ class Node:
         self.send_back = send_back
         self.relies_on = [(tensor, tensor.storage.version) for tensor in relies_on]
         self.is_used_up = False
+        self.result: Any = None
 
     def backward(self, gradient: Any, keep: bool) -> Sequence[Any]:
         """The gradients of the sources. Unless they are to be kept, the numbers that the step relied on are gone afterwards."""
@@ -37,12 +38,13 @@ class Node:
             raise RuntimeError(USED_UP)
         for tensor, version in self.relies_on:
             if tensor.storage.version != version:
-                raise RuntimeError(_changed(tensor, version))
+                raise RuntimeError(_changed(tensor, version, self.name if tensor is self.result else None))
         self.is_used_up = bool(self.relies_on) and not keep
         return self.send_back(gradient)
 
     def result_is_written_to(self, result: Any, target: Any) -> None:
         """The result now lives in another tensor, over which it was written: that one must not change, then."""
+        self.result = target
         self.relies_on = [
             (target, target.storage.version) if one is result else (one, version) for one, version in self.relies_on
         ]
@@ -58,8 +60,9 @@ USED_UP = (
 )
 
 
-def _changed(tensor: Any, version: int) -> str:
-    made_by = f", which is output 0 of {tensor.grad_fn.name.removesuffix('Backward0')}," if tensor.grad_fn else ""
+def _changed(tensor: Any, version: int, name: str | None) -> str:
+    name = name or (tensor.grad_fn.name if tensor.grad_fn else "")
+    made_by = f", which is output 0 of {name.removesuffix('Backward0')}," if name else ""
     return (
         "one of the variables needed for gradient computation has been modified by an inplace operation:"
         f" [torch.{tensor.dtype.long_name}Tensor {list(tensor.shape)}]{made_by} is at version {tensor.storage.version}; expected version"

@@ -21,9 +21,15 @@ class dtype:
     @property
     def c_name(self) -> str:
         """As some of torch's errors call it."""
-        return {"Float": "float", "Double": "double", "Long": "long int", "Byte": "unsigned char", "Char": "signed char"}.get(
-            self.long_name, self.long_name.lower()
-        )
+        return {
+            "Float": "float",
+            "Double": "double",
+            "Long": "long int",
+            "Byte": "unsigned char",
+            "Half": "c10::Half",
+            "BFloat16": "c10::BFloat16",
+            "Char": "signed char",
+        }.get(self.long_name, self.long_name.lower())
 
     @property
     def is_floating_point(self) -> bool:

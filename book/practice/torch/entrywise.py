@@ -27,8 +27,8 @@ def entrywise(
 
     `slopes` has for each operand the derivative of `compute` with regard to it, a function of the entries and of the result's. `keeps`
     says which numbers it needs, and which must not be changed in place therefore: "operands", "others" (than the one whose gradient is
-    asked for), "divisor", "result" or "nothing". If `compute` only chooses among its operands, what is not chosen gets a gradient of 0,
-    even of an infinite one.
+    asked for), "divisor", "result", "all" or "nothing". If `compute` only chooses among its operands, what is not chosen gets a
+    gradient of 0, even of an infinite one.
     """
     kind = kind or dtypes.result_type(*operands)
     tensors = [tensor_like(operand, None if isinstance(operand, Tensor) else _number_kind(operand, kind)) for operand in operands]
@@ -57,6 +57,7 @@ def entrywise(
         "others": [tensor for i, tensor in enumerate(tensors) if any(asked[:i] + asked[i + 1 :])],
         "divisor": tensors if asked[-1] else tensors[1:],
         "result": [result],
+        "all": [*tensors, result],
         "nothing": [],
     }[keeps]
     return record(result, f"{name.capitalize()}Backward0", tensors, send_back, kept)
@@ -119,6 +120,8 @@ def log_logistic(x: float) -> float:
 
 
 def _power(a: float, b: float) -> float:
+    if isinstance(a, int) and isinstance(b, int) and b < 0:
+        return a ** (-b) if a in (1, -1) else 0
     if a == 0 and b < 0:
         return -inf if math.copysign(1, a) < 0 and b % 2 == 1 else inf
     if -inf < a < 0 and isinstance(b, float) and b == b and abs(b) != inf and b != int(b):
@@ -195,7 +198,8 @@ _QUESTIONS: dict[str, Callable] = {
     "signbit": lambda x: math.copysign(1, x) < 0,
 }
 _KEEPS_RESULT = {"exp", "expm1", "exp2", "sigmoid", "tanh", "sqrt", "rsqrt", "reciprocal", "relu"}
-_KEEPS_NOTHING = {"neg", "sign", "floor", "ceil", "round", "trunc"}
+_FLAT = {"sign", "floor", "ceil", "round", "trunc", "relu"}  # where nothing changes, not even an infinite gradient comes through
+_KEEPS_NOTHING = {"neg", "ndtr", "sign", "floor", "ceil", "round", "trunc"}
 _NOT_OF_TRUTH_VALUES = {
     "neg": "Negation, the `-` operator, on a bool tensor is not supported. If you are trying to invert a mask, use the `~` or"
     " `logical_not()` operator instead.",
@@ -224,7 +228,7 @@ def _of_one(name: str) -> Callable:
                 raise NotImplementedError(f"\"{_NOT_IMPLEMENTED_OF_TRUTH_VALUES[name]}_cpu\" not implemented for 'Bool'")
             compute, slope = _KEEPING_THEIR_KIND[name]
             kind = dtypes.int64 if input.dtype is dtypes.bool_ and name == "square" else None
-            return entrywise(name, compute, [slope], [input], kind, keeps, chooses=name == "relu")
+            return entrywise(name, compute, [slope], [input], kind, keeps, chooses=name in _FLAT)
         return entrywise(name, _QUESTIONS[name], None, [input], dtypes.bool_)
 
     function.__name__ = name
@@ -297,6 +301,7 @@ def _floor_of_quotient(a: Any, b: Any) -> Any:
 
 
 def floor_divide(input: Any, other: Any) -> Tensor:
+    _no_truth_values("div_floor_cpu", input, other)
     return _underivable(entrywise("floor_divide", _floor_of_quotient, None, [input, other]), "floor_divide", [input, other])
 
 
@@ -345,7 +350,8 @@ def power(input: Any, exponent: Any) -> Tensor:
         raise NotImplementedError("\"pow\" not implemented for 'Bool'")
     if kind.category == 1 and isinstance(exponent, int) and exponent < 0:
         raise RuntimeError("Integers to negative integer powers are not allowed.")
-    return entrywise("pow", _power, [by_base, by_exponent], [input, exponent])
+    keeps = "all" if isinstance(exponent, Tensor) else "operands"
+    return entrywise("pow", _power, [by_base, by_exponent], [input, exponent], keeps=keeps)
 
 
 def _share(mine: float, others: float, larger: bool) -> float:
@@ -438,6 +444,7 @@ def masked_fill(input: Tensor, mask: Tensor, value: Any) -> Tensor:
         raise RuntimeError(
             f"masked_fill only supports a 0-dimensional value tensor, but got tensor with {value.ndim} dimension{plural}."
         )
+    broadcast_shapes(mask.shape, input.shape)
     number = value.item() if isinstance(value, Tensor) else value
     if input.dtype.category == 1 and isinstance(number, float) and (number != number or abs(number) >= 2**63):
         raise RuntimeError("value cannot be converted to type int64_t without overflow")
@@ -507,6 +514,7 @@ COMPARING |= {
 def _bitwise(name: str, compute: Callable) -> Callable:
     def function(input: Any, other: Any) -> Tensor:
         kind = dtypes.result_type(input, other)
+        broadcast_shapes(*(x.shape for x in (input, other) if isinstance(x, Tensor)))
         if kind.category == 2:
             raise NotImplementedError(f"\"bitwise_{name}_cpu\" not implemented for '{kind.long_name}'")
         return entrywise(name, compute, None, [input, other])

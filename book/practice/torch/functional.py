@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from . import dtypes
-from .entrywise import OF_ONE, entrywise, exponential, floats_only, log_logistic, logistic, where
-from .making import full, make
+from .entrywise import OF_ONE, entrywise, exponential, floats_only, log_logistic, logistic, sign_of, where
+from .making import full, make, nan
 from .missing import Missing, missing
 from .moving import cat
 from .rows import log_softmax
@@ -88,8 +88,9 @@ def _reduced(losses: Tensor, reduction: str) -> Tensor:
 
 def _together(kernel: str, input: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     shape = broadcast_shapes(input.shape, target.shape)
-    floats_only(kernel, dtypes.result_type(input.expand(shape), target.expand(shape)))
-    return input.expand(shape), target.expand(shape)
+    kind = dtypes.result_type(input.expand(shape), target.expand(shape))
+    floats_only(kernel, kind)
+    return input.expand(shape).to(kind), target.expand(shape).to(kind)
 
 
 def mse_loss(input: Tensor, target: Tensor, reduction: str = "mean") -> Tensor:
@@ -102,23 +103,47 @@ def l1_loss(input: Tensor, target: Tensor, reduction: str = "mean") -> Tensor:
     return _reduced((input.expand(shape) - target.expand(shape)).abs(), reduction)
 
 
+def _bent(name: str, input: Tensor, target: Tensor, knee: float, curvature: float) -> Tensor:
+    """A parabola of the difference up to `knee`, and its tangents from there on."""
+
+    def compute(a: float, b: float) -> float:
+        far = abs(a - b)
+        return 0.5 * curvature * far * far if far < knee else curvature * knee * (far - 0.5 * knee) if knee else far
+
+    def slope(a: float, b: float, y: float) -> float:
+        return (
+            curvature * (a - b)
+            if abs(a - b) < knee
+            else (curvature * knee if knee else 1.0) * (sign_of(a - b) if a == a and b == b else nan)
+        )
+
+    return entrywise(name, compute, [slope, lambda a, b, y: -slope(a, b, y)], [input, target])
+
+
 def smooth_l1_loss(input: Tensor, target: Tensor, reduction: str = "mean", beta: float = 1.0) -> Tensor:
     input, target = _together("smooth_l1_cpu", input, target)
-    distance = (input - target).abs()
-    return _reduced(where(distance < beta, 0.5 * distance**2 / beta, distance - 0.5 * beta), reduction)
+    return _reduced(_bent("smooth_l1", input, target, beta, 1 / beta if beta else 0.0), reduction)
 
 
 def huber_loss(input: Tensor, target: Tensor, reduction: str = "mean", delta: float = 1.0) -> Tensor:
+    if target.dtype.is_floating_point and not input.dtype.is_floating_point:
+        kinds = f"{target.dtype.long_name} can't be cast to the desired output type {input.dtype.long_name}"
+        raise RuntimeError(f"result type {kinds}")
+    kind = input.dtype
     input, target = _together("huber_cpu", input, target)
-    distance = (input - target).abs()
-    return _reduced(where(distance <= delta, 0.5 * distance**2, delta * (distance - 0.5 * delta)), reduction)
+    return _reduced(_bent("huber", input, target, delta, 1.0).to(kind), reduction)
 
 
 def binary_cross_entropy_with_logits(input: Tensor, target: Tensor, weight: Any = None, reduction: str = "mean") -> Tensor:
     if target.shape != input.shape:
         raise ValueError(f"Target size ({target.shape}) must be the same as input size ({input.shape})")
-    losses = -(target * logsigmoid(input) + (1 - target) * logsigmoid(-input))
-    return _reduced(losses if weight is None else losses * weight, reduction)
+    floats_only("log_sigmoid_cpu", input.dtype)
+    if not target.dtype.is_floating_point:
+        kinds = f"{input.dtype.long_name} can't be cast to the desired output type {target.dtype.long_name}"
+        raise RuntimeError(f"result type {kinds}")
+    losses = (1 - target) * input - logsigmoid(input)
+    losses = (losses if weight is None else losses * weight).to(target.dtype)
+    return _reduced(losses, reduction)
 
 
 def binary_cross_entropy(input: Tensor, target: Tensor, weight: Any = None, reduction: str = "mean") -> Tensor:

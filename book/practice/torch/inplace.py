@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from .autograd import is_recording
-from .tensor import Storage, Tensor
+from .tensor import ONE_LOCATION, Storage, Tensor, meet_halfway
 
 
 def in_place(function: Callable, name: str) -> Callable:
@@ -14,14 +14,16 @@ def in_place(function: Callable, name: str) -> Callable:
 
     def changed(self: Tensor, *args: Any, **kwargs: Any) -> Tensor:
         self.refuse_if_leaf()
+        for one in args:
+            if isinstance(one, Tensor) and one.storage.numbers is self.storage.numbers and meet_halfway(self, one):
+                raise RuntimeError(ONE_LOCATION)
         original = _as_it_was(self) if is_recording() else self
         result = function(original, *args, **kwargs)
-        if result.dtype.category > self.dtype.category:
-            raise RuntimeError(
-                f"result type {result.dtype.long_name} can't be cast to the desired output type {self.dtype.long_name}"
-            )
         if result.shape != self.shape:
             raise RuntimeError(f"output with shape {list(self.shape)} doesn't match the broadcast shape {list(result.shape)}")
+        if result.dtype.category > self.dtype.category:
+            kinds = f"{result.dtype.long_name} can't be cast to the desired output type {self.dtype.long_name}"
+            raise RuntimeError(f"result type {kinds}")
         step = result.step
         self.write(result)
         if step is not None:

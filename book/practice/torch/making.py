@@ -25,6 +25,7 @@ def record(result: Tensor, name: str, sources: Sequence[Tensor], send_back: Call
     """Let the result remember how it was made, if a gradient may be asked for."""
     if is_recording() and result.dtype.is_floating_point and any(source.requires_grad for source in sources):
         result.requires_grad, result.step = True, Node(name, sources, send_back, relies_on)
+        result.step.result = result
     return result
 
 

@@ -45,6 +45,8 @@ def picked(input: Tensor, dim: int, index: Tensor) -> Tensor:
     if max(index.ndim, 1) != max(input.ndim, 1) and count(index.shape):
         raise RuntimeError("Index tensor must have the same number of dimensions as input tensor")
     axis = axis_of(dim, input.ndim)
+    if not count(index.shape):
+        return _rearranged("Gather", input, [], index.shape)
     if not input.ndim or not index.ndim:
         return picked(input.reshape(1) if not input.ndim else input, 0, index.reshape(-1)).reshape(index.shape)
     if any(size > own for i, (size, own) in enumerate(zip(index.shape, input.shape, strict=True)) if i != axis):
@@ -86,6 +88,8 @@ def index_select(input: Tensor, dim: int, index: Tensor) -> Tensor:
         if count(index.shape) != 1:
             raise RuntimeError(f"index_select(): Index to scalar can have only 1 value, got {count(index.shape)} value(s)")
         return input.reshape(1)[index.reshape(1)].reshape(())
+    if count(index.shape) and not input.shape[axis] and input.ndim > 1:
+        raise RuntimeError("index_select(): self indexing axis dim should be positive")
     if any(not 0 <= entry < input.shape[axis] for entry in index.flat()):
         raise IndexError("index out of range in self")
     return input[(slice(None),) * axis + (index.reshape(-1),)]
@@ -143,7 +147,8 @@ def cat(tensors: Sequence[Tensor], dim: int = 0) -> Tensor:
         raise RuntimeError(
             f"zero-dimensional tensor (at position {next(i for i, t in enumerate(tensors) if not t.shape)}) cannot be concatenated"
         )
-    tensors = [t for t in tensors if t.shape != (0,)] or tensors[:1]
+    every = tensors
+    tensors = [t for t in every if t.shape != (0,)] or every[:1]
     axis = axis_of(dim, tensors[0].ndim)
     for number, other in enumerate(tensors):
         if other.ndim != tensors[0].ndim:
@@ -166,15 +171,19 @@ def cat(tensors: Sequence[Tensor], dim: int = 0) -> Tensor:
         for value in flat[i * width : (i + 1) * width]
     ]
 
-    def send_back(gradient: Tensor) -> list[Tensor]:
-        back, at = [], 0
-        for t in tensors:
+    def send_back(gradient: Tensor) -> list[Tensor | None]:
+        back: list[Tensor | None] = []
+        at = 0
+        for t in every:
+            if not any(t is one for one in tensors):
+                back.append(None)
+                continue
             part = gradient.narrow(axis, at, t.shape[axis])
             back.append(part.to(t.dtype) if t.dtype.is_floating_point else part)
             at += t.shape[axis]
         return back
 
-    return record(make(numbers, shape, kind), "CatBackward0", tensors, send_back)
+    return record(make(numbers, shape, kind), "CatBackward0", every, send_back)
 
 
 concat = concatenate = cat
@@ -187,6 +196,7 @@ def stack(tensors: Sequence[Tensor], dim: int = 0) -> Tensor:
             raise TypeError(f"expected Tensor as element {number} in argument 0, but got {type(other).__name__}")
     if not tensors:
         raise RuntimeError("stack expects a non-empty TensorList")
+    axis_of(dim, tensors[0].ndim + 1)
     for number, other in enumerate(tensors):
         if other.shape != tensors[0].shape:
             raise RuntimeError(
@@ -230,6 +240,8 @@ def repeat(input: Tensor, *sizes: Any) -> Tensor:
 
 def repeat_interleave(input: Tensor, repeats: int, dim: int | None = None) -> Tensor:
     x, dim = (input.reshape(-1), 0) if dim is None else (input, dim)
+    if not x.ndim:
+        raise IndexError("Dimension out of range (expected to be in range of [-1, 0], but got 1)")  # so torch says
     return index_select(
         x, dim, tensor([i for i in range(x.shape[axis_of(dim, x.ndim)]) for _ in range(repeats)], dtype=dtypes.int64)
     )
@@ -288,6 +300,8 @@ def scatter_add(input: Tensor, dim: int, index: Tensor, src: Tensor) -> Tensor:
 
 
 def _scattered(x: Tensor, dim: int, index: Tensor, src: Any, adding: bool) -> Tensor:
+    if index.ndim != x.ndim and count(index.shape) and index.ndim and x.ndim:
+        raise RuntimeError("Index tensor must have the same number of dimensions as self tensor")
     source = (
         src.narrow(0, 0, index.shape[0])
         if isinstance(src, Tensor) and index.shape

@@ -193,11 +193,13 @@ def _equip() -> None:
         "expand_as": lambda self, other: self.expand(other.shape),
         "reshape_as": lambda self, other: self.reshape(other.shape),
         "type_as": lambda self, other: self.to(other.dtype),
-        "new_tensor": lambda self, data, *, dtype=None: making.tensor(data, dtype=dtype or self.dtype),
-        "new_zeros": lambda self, *size, dtype=None: making.zeros(*size, dtype=dtype or self.dtype),
-        "new_ones": lambda self, *size, dtype=None: making.ones(*size, dtype=dtype or self.dtype),
-        "new_empty": lambda self, *size, dtype=None: making.zeros(*size, dtype=dtype or self.dtype),
-        "new_full": lambda self, size, fill_value, *, dtype=None: making.full(size, fill_value, dtype=dtype or self.dtype),
+        "new_tensor": lambda self, data, *, dtype=None, device=None: making.tensor(data, dtype=dtype or self.dtype),
+        "new_zeros": lambda self, *size, dtype=None, device=None: making.zeros(*size, dtype=dtype or self.dtype),
+        "new_ones": lambda self, *size, dtype=None, device=None: making.ones(*size, dtype=dtype or self.dtype),
+        "new_empty": lambda self, *size, dtype=None, device=None: making.zeros(*size, dtype=dtype or self.dtype),
+        "new_full": lambda self, size, fill_value, *, dtype=None, device=None: making.full(
+            size, fill_value, dtype=dtype or self.dtype
+        ),
     }
     for method, kind in _CONVERSIONS:
         methods[method] = lambda self, _kind=kind: self.to(_kind)
@@ -220,12 +222,18 @@ def _equip_operators() -> None:
         setattr(Tensor, f"__r{name}__", _operator(_turned(function)))
         if name != "matmul":
             setattr(Tensor, f"__i{name}__", _operator(in_place(function, f"__i{name}__")))
+    setattr(Tensor, "__rtruediv__", _operator(_number_by))  # noqa: B010
     for name in ("eq", "ne", "lt", "le", "gt", "ge"):
         setattr(Tensor, f"__{name}__", _operator(entrywise.COMPARING[name]))
     for name in ("neg", "abs"):
         setattr(Tensor, f"__{name}__", _BOTH[name])
     setattr(Tensor, "__invert__", entrywise.bitwise_not)  # noqa: B010
     setattr(Tensor, "__pos__", lambda self: self)  # noqa: B010
+
+
+def _number_by(x: Tensor, number: float) -> Tensor:
+    """number / x, as torch computes it."""
+    return entrywise.mul(entrywise.OF_ONE["reciprocal"](x), number)
 
 
 def _turned(function: Callable) -> Callable:

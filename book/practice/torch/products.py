@@ -14,10 +14,11 @@ from .tensor import Tensor
 
 def matmul(input: Tensor, other: Tensor) -> Tensor:
     need_tensor("matmul", "other", 2, other)
+    if input.ndim == other.ndim == 1 and input.dtype is not other.dtype:
+        kinds = f"{input.dtype.long_name} and {other.dtype.long_name}"
+        raise RuntimeError(f"dot : expected both vectors to have same dtype, but found {kinds}")
     if not input.ndim or not other.ndim:
         raise RuntimeError(f"both arguments to matmul need to be at least 1D, but they are {input.ndim}D and {other.ndim}D")
-    if input.dtype is not other.dtype:
-        raise RuntimeError(f"expected m1 and m2 to have the same dtype, but got: {input.dtype.c_name} != {other.dtype.c_name}")
     a = input.unsqueeze(0) if input.ndim == 1 else input
     b = other.unsqueeze(1) if other.ndim == 1 else other
     if a.shape[-1] != b.shape[-2]:
@@ -39,7 +40,9 @@ def matmul(input: Tensor, other: Tensor) -> Tensor:
         raise RuntimeError(
             f"mat1 and mat2 shapes cannot be multiplied ({a.shape[-2]}x{a.shape[-1]} and {b.shape[-2]}x{b.shape[-1]})"
         )
-    if input.dtype.category == 0:
+    if input.dtype is not other.dtype:
+        raise RuntimeError(f"expected m1 and m2 to have the same dtype, but got: {input.dtype.c_name} != {other.dtype.c_name}")
+    if input.dtype.category == 0 and count(a.shape) and count(b.shape):
         raise NotImplementedError(f"\"addmm_impl_cpu_\" not implemented for '{input.dtype.long_name}'")
     batch = broadcast_shapes(a.shape[:-2], b.shape[:-2])
     result = _batched(a.expand(*batch, *a.shape[-2:]), b.expand(*batch, *b.shape[-2:]))

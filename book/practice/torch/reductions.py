@@ -16,11 +16,21 @@ from .moving import picked
 from .shapes import axes_of, axis_of, count, positions, strides_of
 from .tensor import Storage, Tensor
 
+
+def _named(name: str, *fields: str) -> Any:
+    """A named tuple that shows itself as torch's do."""
+
+    def shown(self: Any) -> str:
+        entries = ",\n".join(f"{field}={value!r}" for field, value in zip(fields, self, strict=True))
+        return f"torch.return_types.{name}(\n{entries})"
+
+    return type(name, (namedtuple(name, fields),), {"__repr__": shown, "__slots__": ()})
+
+
 VALUES_AND_PLACES: dict[str, Any] = {
-    name: namedtuple(name, ["values", "indices"])
-    for name in ("min", "max", "sort", "topk", "cummax", "median", "kthvalue", "cummin")
+    name: _named(name, "values", "indices") for name in ("min", "max", "sort", "topk", "cummax", "cummin", "median", "kthvalue")
 }
-VALUES_AND_PLACES["aminmax"] = namedtuple("aminmax", ["min", "max"])
+VALUES_AND_PLACES["aminmax"] = _named("aminmax", "min", "max")
 
 
 def groups_of(x: Tensor, axes: Sequence[int]) -> tuple[list[list[Any]], list[list[int]], tuple[int, ...]]:
@@ -38,7 +48,7 @@ def _without(shape: Sequence[int], axes: Sequence[int]) -> tuple[int, ...]:
     return tuple(size for axis, size in enumerate(shape) if axis not in axes)
 
 
-def _reduce(
+def reduced(
     name: str, x: Tensor, dim: Any, keepdim: bool, compute: Callable, kind: dtypes.dtype, slopes: Callable | None = None
 ) -> Tensor:
     """One number for each group of entries. `slopes` gives, for a group and its number, the derivative by each entry."""
@@ -69,7 +79,7 @@ def _total(values: list[Any]) -> Any:
 
 
 def sum_(input: Tensor, dim: Any = None, keepdim: bool = False, *, dtype: Any = None) -> Tensor:
-    return _reduce("Sum", input, dim, keepdim, _total, sum_kind(input, dtype), lambda group, y: [1.0] * len(group))
+    return reduced("Sum", input, dim, keepdim, _total, sum_kind(input, dtype), lambda group, y: [1.0] * len(group))
 
 
 def _floats_only(name: str, x: Tensor) -> None:
@@ -83,7 +93,7 @@ def _floats_only(name: str, x: Tensor) -> None:
 def mean(input: Tensor, dim: Any = None, keepdim: bool = False, *, dtype: Any = None) -> Tensor:
     x = input.to(dtype) if dtype else input
     _floats_only("mean", x)
-    return _reduce(
+    return reduced(
         "Mean",
         x,
         dim,
@@ -104,7 +114,10 @@ def norm(input: Tensor, p: Any = 2, dim: Any = None, keepdim: bool = False) -> T
 
 
 def nansum(input: Tensor, dim: Any = None, keepdim: bool = False) -> Tensor:
-    return sum_(where(OF_ONE["isnan"](input), 0, input), dim, keepdim)
+    result = sum_(where(OF_ONE["isnan"](input), 0, input), dim, keepdim)
+    if result.step is not None:
+        result.step.relies_on = [(input, input.storage.version)]
+    return result
 
 
 def nanmean(input: Tensor, dim: Any = None, keepdim: bool = False) -> Tensor:
@@ -136,7 +149,7 @@ def var(input: Tensor, dim: Any = None, unbiased: Any = None, keepdim: bool = Fa
         centre = divide(_total(group), len(group))
         return [divide(2 * (v - centre), max(len(group) - less, 0)) for v in group]
 
-    return _reduce("Var", input, dim, keepdim, compute, input.dtype, slopes)
+    return reduced("Var", input, dim, keepdim, compute, input.dtype, slopes)
 
 
 def std(input: Tensor, dim: Any = None, unbiased: Any = None, keepdim: bool = False, *, correction: Any = None) -> Tensor:
@@ -166,15 +179,15 @@ def prod(input: Tensor, dim: Any = None, keepdim: bool = False, *, dtype: Any = 
     def slopes(group: list[float], y: float) -> list[float]:
         return [math.prod(v for j, v in enumerate(group) if j != i) for i in range(len(group))]
 
-    return _reduce("Prod", input, dim, keepdim, math.prod, sum_kind(input, dtype), slopes)
+    return reduced("Prod", input, dim, keepdim, math.prod, sum_kind(input, dtype), slopes)
 
 
 def all_(input: Tensor, dim: Any = None, keepdim: bool = False) -> Tensor:
-    return _reduce("all", input, dim, keepdim, all, dtypes.bool_)
+    return reduced("all", input, dim, keepdim, all, dtypes.bool_)
 
 
 def any_(input: Tensor, dim: Any = None, keepdim: bool = False) -> Tensor:
-    return _reduce("any", input, dim, keepdim, any, dtypes.bool_)
+    return reduced("any", input, dim, keepdim, any, dtypes.bool_)
 
 
 def count_nonzero(input: Tensor, dim: Any = None) -> Tensor:
@@ -197,7 +210,7 @@ def chosen(name: str, x: Tensor, axis: int, keepdim: bool, which: Callable) -> A
     """Along an axis the entry that is chosen, and where it stands."""
     axis = axis_of(axis, x.ndim)
     x_ = x if x.ndim else x.reshape(1)
-    index = _reduce(name, x_, axis, True, which, dtypes.int64)
+    index = reduced(name, x_, axis, True, which, dtypes.int64)
     values = picked(x_, axis, index)
     if x.ndim and keepdim:
         return values, index
@@ -218,12 +231,17 @@ def _extreme(name: str, better: Callable, pairwise: Callable) -> Callable:
 
 def extremes(x: Tensor, dim: Any, keepdim: bool, better: Callable) -> Tensor:
     """The largest or smallest; where several are, they share the gradient."""
+    return shared("Amax", x, dim, keepdim, lambda values: _best(values, better))
+
+
+def shared(name: str, x: Tensor, dim: Any, keepdim: bool, which: Callable) -> Tensor:
+    """The entry that `which` chooses; all that are equal to it share the gradient."""
 
     def slopes(group: list[float], y: float) -> list[float]:
         ties = [v == y or (v != v and y != y) for v in group]
         return [tie / sum(ties) for tie in ties]
 
-    return _reduce("Amax", x, dim, keepdim, lambda v: v[_best(v, better)], x.dtype, slopes)
+    return reduced(name, x, dim, keepdim, lambda values: values[which(values)] if values else nan, x.dtype, slopes)
 
 
 max_ = _extreme("max", operator.gt, maximum)
@@ -238,9 +256,10 @@ def _not_of_nothing(name: str, x: Tensor, dim: Any) -> None:
         hint = "" if name.startswith("arg") else " Specify the reduction dim with the 'dim' argument."
         error = IndexError if name.startswith("arg") else RuntimeError
         raise error(f"{name}(): Expected reduction dim to be specified for input.numel() == 0.{hint}")
-    for axis in axes_of(dim, x.ndim):
-        if not x.shape[axis]:
-            raise IndexError(f"{name}(): Expected reduction dim {axis} to have non-zero size.")
+    for axis in dim if isinstance(dim, (tuple, list)) else [dim]:
+        if not x.shape[axis_of(axis, x.ndim)]:
+            shown = axis if name in ("amax", "amin") else axis_of(axis, x.ndim)
+            raise IndexError(f"{name}(): Expected reduction dim {shown} to have non-zero size.")
 
 
 def amax(input: Tensor, dim: Any = (), keepdim: bool = False) -> Tensor:
@@ -258,7 +277,7 @@ def _arg(name: str, better: Callable) -> Callable:
         if input.dtype is dtypes.bool_:
             raise RuntimeError(f"{name}(): does not support bool input")
         _not_of_nothing(name, input, dim)
-        return _reduce("arg", input, dim, keepdim, lambda v: _best(v, better), dtypes.int64)
+        return reduced("arg", input, dim, keepdim, lambda v: _best(v, better), dtypes.int64)
 
     return function
 
@@ -268,12 +287,14 @@ argmax, argmin = _arg("argmax", operator.gt), _arg("argmin", operator.lt)
 
 def logsumexp(input: Tensor, dim: Any, keepdim: bool = False) -> Tensor:
     def compute(values: list[float]) -> float:
+        if any(v != v for v in values):
+            return nan
         top = max(values, default=-inf)
-        if abs(top) == inf or top != top:
+        if abs(top) == inf:
             return top
         return top + math.log(math.fsum(math.exp(v - top) for v in values))
 
-    return _reduce(
+    return reduced(
         "Logsumexp", input, dim, keepdim, compute, float_kind(input), lambda group, y: [exponential(v - y) for v in group]
     )
 
@@ -285,6 +306,8 @@ def aminmax(input: Tensor, *, dim: Any = None, keepdim: bool = False) -> Any:
 def cov(input: Tensor, *, correction: int = 1) -> Tensor:
     x = input.unsqueeze(0) if input.ndim < 2 else input
     x = x.unsqueeze(0) if x.ndim < 2 else x
+    if x.dtype is dtypes.bool_:
+        raise RuntimeError("cov(): bool dtype is not supported for input")
     x = x if x.dtype.is_floating_point else x.to(dtypes.float32)
     if x.ndim > 2:
         raise RuntimeError(f"cov(): expected input to have two or fewer dimensions but got an input with {x.ndim} dimensions")

@@ -8,11 +8,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from . import dtypes
-from .entrywise import exponential, floats_only, lerp, log_add_exp
+from .entrywise import OF_ONE, exponential, floats_only, lerp, log_add_exp, where
 from .making import inf, make, nan, record, tensor, tensor_like
 from .missing import Missing
 from .moving import index_select, picked, stack
-from .reductions import VALUES_AND_PLACES, chosen, groups_of, sum_kind
+from .reductions import VALUES_AND_PLACES, chosen, groups_of, shared, sum_kind
 from .shapes import axis_of, count
 from .tensor import Tensor
 
@@ -23,12 +23,10 @@ def median(input: Tensor, dim: Any = None, keepdim: bool = False) -> Any:
             return next(i for i, value in enumerate(values) if value != value)
         return sorted(range(len(values)), key=values.__getitem__)[(len(values) - 1) // 2]
 
-    if input.dtype is dtypes.bool_:
+    if input.dtype is dtypes.bool_ and count(input.shape):
         raise NotImplementedError("\"median_cpu\" not implemented for 'Bool'")
-    if dim is None and not count(input.shape):
-        return make([nan if input.dtype.is_floating_point else -(2**63)], (), input.dtype)
     if dim is None:
-        return chosen("median", input.reshape(-1), 0, False, which)[0]
+        return shared("Median", input, None, False, which)
     return VALUES_AND_PLACES["median"](*chosen("median", input, dim, keepdim, which))
 
 
@@ -49,6 +47,7 @@ def _quantile(x: Tensor, level: float, dim: Any, keepdim: bool) -> Tensor:
     low, high = math.floor(at), math.ceil(at)
     parts = [index_select(ordered, dim, tensor([i])) for i in (low, high)]
     result = lerp(parts[0], parts[1], at - low)
+    result = where(OF_ONE["isnan"](x).any(dim, True), nan, result)
     return result if keepdim else result.squeeze(dim)
 
 
@@ -81,7 +80,7 @@ def _along(name: str, x: Tensor, axis: int, compute: Callable, send: Callable | 
             )
         ]
 
-    keeps = {"Cumprod": [x], "Softmax": [result], "LogSoftmax": [result]}.get(name, [])
+    keeps = {"Cumprod": [x, result], "Logcumsumexp": [x, result], "Softmax": [result], "LogSoftmax": [result]}.get(name, [])
     return record(result, f"{name}Backward0", [x], send_back, keeps)
 
 
@@ -201,6 +200,10 @@ def _running_best(better: Callable) -> Callable:
 
 def _cumulative(name: str, better: Callable) -> Callable:
     def function(input: Tensor, dim: int) -> Any:
+        if not input.ndim and dim not in (-1, 0):
+            raise IndexError(f"{name}(): Expected reduction dim -1 or 0 for scalar but got {dim}")
+        if not count(input.shape):
+            return VALUES_AND_PLACES[name](input.clone(), make([], input.shape, dtypes.int64))
         places = _along(name, input, dim, _running_best(better), None, dtypes.int64)
         return VALUES_AND_PLACES[name](picked(input, dim, places), places)
 
@@ -211,6 +214,7 @@ cummax, cummin = _cumulative("cummax", operator.ge), _cumulative("cummin", opera
 
 
 def logcumsumexp(input: Tensor, dim: int) -> Tensor:
+    axis_of(dim, input.ndim)
     floats_only("logcumsumexp_out_cpu", input.dtype)
 
     def send(g: list[float], row: list[float], out: list[float]) -> list[float]:

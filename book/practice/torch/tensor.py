@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from . import dtypes
 from .autograd import Leaf, Node, accumulate, is_recording
 from .missing import Missing, missing
+from .printing import shown
 from .shapes import Size, axis_of, broadcast_shapes, count, positions, strides_of
 
 
@@ -31,6 +32,7 @@ class Tensor:
         "dtype",
         "grad",
         "offset",
+        "one_of",
         "shape",
         "step",
         "storage",
@@ -48,6 +50,7 @@ class Tensor:
         self.step: Node | None = None
         self.base: Tensor | None = None
         self._base_step: Node | None = None
+        self.one_of = ""  # which of several views, made at once, this is
 
     if TYPE_CHECKING:  # `names` gives tensors their operators
 
@@ -140,12 +143,9 @@ class Tensor:
 
     def tolist(self) -> Any:
         nested: list[Any] = self.flat()
-        for size in reversed(self.shape[1:]):
-            nested = (
-                [nested[i : i + size] for i in range(0, len(nested), size)]
-                if size
-                else [[] for _ in range(count(self.shape[:-1]))]
-            )
+        for axis in reversed(range(1, self.ndim)):
+            size = self.shape[axis]
+            nested = [nested[i * size : (i + 1) * size] for i in range(count(self.shape[:axis]))]
         return nested if self.shape else nested[0]
 
     def _single(self) -> Any:
@@ -179,7 +179,7 @@ class Tensor:
     def __iter__(self) -> Iterator[Tensor]:
         if not self.shape:
             raise TypeError("iteration over a 0-d tensor")
-        return iter([self[i] for i in range(self.shape[0])])
+        return iter(self.unbind())
 
     def __contains__(self, value: Any) -> bool:
         return bool((self == value).any())
@@ -190,10 +190,13 @@ class Tensor:
         return format(self.item(), spec) if not self.shape else format(repr(self), spec)
 
     def __repr__(self) -> str:
-        body = _shown(self.tolist(), self.dtype, len("tensor("))
+        if count(self.shape) > 1000:
+            raise Missing("printing of more than 1000 entries")
+        body = shown(self.flat(), self.tolist(), self.shape, len("tensor(")) if count(self.shape) else "[]"
+        size = f", size={tuple(self.shape)}" if not count(self.shape) and self.ndim > 1 else ""
         kind = "" if self.dtype in (dtypes.float32, dtypes.int64, dtypes.bool_) else f", dtype={self.dtype}"
         grad = f", grad_fn=<{self.grad_fn.name}>" if self.grad_fn else ", requires_grad=True" if self.requires_grad else ""
-        return f"tensor({body}{kind}{grad})"
+        return f"tensor({body}{size}{kind}{grad})"
 
     def numpy(self) -> Any:
         raise Missing("Tensor.numpy")
@@ -256,6 +259,7 @@ class Tensor:
     def as_view(self, shape: Sequence[int], strides: Sequence[int], offset: int) -> Tensor:
         """A tensor of other shape on the same numbers."""
         view = Tensor(self.storage, shape, self.dtype, strides, offset)
+        view.one_of = self.one_of
         view._made_as_view(self)
         return view
 
@@ -271,8 +275,8 @@ class Tensor:
             view.write(value)
             return
         places, shape = view._picked(rest)
-        value = _tensor_of(value, self.dtype)
-        if value.dtype is not self.dtype and value.ndim:
+        given, value = value, _tensor_of(value, self.dtype)
+        if value.dtype is not self.dtype and (count(value.shape) != 1 or not self.ndim) and isinstance(given, Tensor):
             raise RuntimeError(
                 f"Index put requires the source and destination dtypes match, got {self.dtype.long_name} for the destination and"
                 f" {value.dtype.long_name} for the source."
@@ -347,9 +351,11 @@ class Tensor:
         for axis in axes:
             size = self.shape[axis]
             for entry in picks[axis].flat():
-                if not -size <= entry < size:
+                if not size:
+                    raise IndexError("index is out of bounds for dimension with size 0")
+                if not -size <= entry < size and count(self.shape):
                     raise IndexError(f"index {entry} is out of bounds for dimension {axis} with size {size}")
-            chosen.append([entry % size for entry in spread(picks[axis], together)])
+            chosen.append([entry % max(size, 1) for entry in spread(picks[axis], together)])
         first = axes[0] if axes == list(range(axes[0], axes[-1] + 1)) else 0
         others = [axis for axis in range(self.ndim) if axis not in axes]
         before = [axis for axis in others if axis < first]
@@ -380,7 +386,7 @@ class Tensor:
     def write(self, value: Any) -> Tensor:
         """Put these numbers in place of the tensor's own, with their graph."""
         value = _tensor_of(value, self.dtype)
-        if value is not self and value.storage.numbers is self.storage.numbers and _meet_halfway(self, value):
+        if value is not self and value.storage.numbers is self.storage.numbers and meet_halfway(self, value):
             raise RuntimeError(ONE_LOCATION)
         if any(size > 1 and not stride for size, stride in zip(self.shape, self.strides, strict=True)):
             raise RuntimeError(
@@ -395,6 +401,12 @@ class Tensor:
         owner = self
         while owner.base is not None:
             owner = owner.base
+        if is_recording() and self.one_of and self.requires_grad:
+            raise RuntimeError(
+                f"Output {self.one_of} is a view and is being modified inplace. This view is the output of a function that returns"
+                " multiple views. Such functions do not allow the output views to be modified inplace. You should replace the inplace"
+                " operation by an out-of-place one."
+            )
         if is_recording() and owner.requires_grad and owner.grad_fn is None:
             what = "a leaf Variable that requires grad" if owner is self else "a view of a leaf Variable that requires grad"
             raise RuntimeError(f"{what} is being used in an in-place operation.")
@@ -406,7 +418,7 @@ class Tensor:
         for place, number in zip(places, self.dtype.numbers(numbers), strict=True):
             self.storage.numbers[place] = number
         self.storage.version += 1
-        if not is_recording() or not (owner.requires_grad or value.requires_grad):
+        if not is_recording() or not self.dtype.is_floating_point or not (owner.requires_grad or value.requires_grad):
             return
         order = {place: number for number, place in enumerate(positions(owner.shape, owner.strides, owner.offset))}
         written = [order[place] for place in places]
@@ -416,7 +428,7 @@ class Tensor:
             to_value = Tensor(Storage([kept[place] for place in written]), shape, gradient.dtype)
             for place in written:
                 kept[place] = 0.0
-            return Tensor(Storage(kept), gradient.shape, gradient.dtype), sum_to(to_value, value.shape)
+            return Tensor(Storage(kept), gradient.shape, gradient.dtype), _as_kind(sum_to(to_value, value.shape), value.dtype)
 
         owner.step = Node("torch::autograd::CopySlices", (owner, value), send_back)
         owner.requires_grad = True
@@ -485,12 +497,17 @@ ONE_LOCATION = (
 )
 
 
-def _meet_halfway(a: Tensor, b: Tensor) -> bool:
+def meet_halfway(a: Tensor, b: Tensor) -> bool:
     """Whether two tensors overlap in the row and are not the same: torch sees it if both lie without gaps."""
     one, other = a.places(), b.places()
     if not one or not other or any(max(p) - min(p) + 1 != len(set(p)) for p in (one, other)):
         return False
     return one != other and max(min(one), min(other)) <= min(max(one), max(other))
+
+
+def _as_kind(gradient: Tensor, kind: dtypes.dtype) -> Tensor:
+    """The gradient in the kind of what it belongs to."""
+    return gradient if gradient.dtype is kind else Tensor(Storage(kind.numbers(gradient.flat())), gradient.shape, kind)
 
 
 def _is_mask(entry: Any) -> bool:
@@ -564,6 +581,8 @@ def from_nested(value: Any, kind: dtypes.dtype | None = None) -> Tensor:
         level = [part for entry in level for part in entry]
     kinds = [entry.dtype if isinstance(entry, Tensor) else dtypes.of_number(entry) for entry in level]
     numbers = [entry.item() if isinstance(entry, Tensor) else entry for entry in level]
+    if any(isinstance(number, complex) for number in numbers):
+        raise Missing("torch.complex64")
     for number in numbers:
         if not isinstance(number, (int, float)):
             raise TypeError(f"new(): invalid data type '{type(number).__name__}'")
@@ -573,12 +592,3 @@ def from_nested(value: Any, kind: dtypes.dtype | None = None) -> Tensor:
 
 def _tensor_of(value: Any, kind: dtypes.dtype) -> Tensor:
     return value if isinstance(value, Tensor) else from_nested(value, kind)
-
-
-def _shown(value: Any, kind: dtypes.dtype, indent: int) -> str:
-    if not isinstance(value, list):
-        return f"{value:.4f}" if kind.is_floating_point and value == value and abs(value) != float("inf") else str(value)
-    if not value or not isinstance(value[0], list):
-        return f"[{', '.join(_shown(entry, kind, 0) for entry in value)}]"
-    inner = (",\n" + " " * (indent + 1)).join(_shown(entry, kind, indent + 1) for entry in value)
-    return f"[{inner}]"

@@ -6,6 +6,7 @@ import operator
 from collections.abc import Sequence
 from typing import Any
 
+from . import dtypes
 from .making import sizes_of
 from .missing import Missing
 from .shapes import axes_of, axis_of, broadcast_shapes, count, strides_of
@@ -25,20 +26,47 @@ def _with_inferred(shape: Sequence[int], total: int) -> tuple[int, ...]:
     return tuple(total // known if size == -1 else size for size in shape)
 
 
+def _view_strides(x: Tensor, shape: Sequence[int]) -> tuple[int, ...] | None:
+    """The strides with which the same numbers have another shape; None if there are none.
+
+    Axes that lie in the row without gaps form a run; the new axes must divide each run between them.
+    """
+    if x.is_contiguous() or not count(shape):
+        return strides_of(shape)
+    strides, axis, last = [0] * len(shape), len(shape) - 1, x.strides[-1]
+    old = new = 1
+    for place in reversed(range(x.ndim)):
+        old *= x.shape[place]
+        if place and (x.shape[place - 1] == 1 or x.strides[place - 1] == old * last):
+            continue
+        while axis >= 0 and (new < old or shape[axis] == 1):
+            strides[axis] = new * last
+            new *= shape[axis]
+            axis -= 1
+        if new != old:
+            return None
+        if place:
+            last, old, new = x.strides[place - 1], 1, 1
+    return tuple(strides) if axis == -1 else None
+
+
 def reshape(input: Tensor, *shape: Any) -> Tensor:
     sizes = _with_inferred(sizes_of(shape), count(input.shape))
-    x = input if input.is_contiguous() else input.clone()
-    return view_of(x, sizes, strides_of(sizes))
+    strides = _view_strides(input, sizes)
+    return view_of(input.clone(), sizes, strides_of(sizes)) if strides is None else view_of(input, sizes, strides)
 
 
 def view(input: Tensor, *shape: Any) -> Tensor:
+    if len(shape) == 1 and isinstance(shape[0], dtypes.dtype):
+        raise Missing("Tensor.view of another dtype")
     sizes = _with_inferred(sizes_of(shape), count(input.shape))
-    if not input.is_contiguous():
+    strides = _view_strides(input, sizes)
+    if strides is None:
         raise RuntimeError(
             "view size is not compatible with input tensor's size and stride (at least one dimension spans across two contiguous"
             " subspaces). Use .reshape(...) instead."
         )
-    return view_of(input, sizes, strides_of(sizes))
+    return view_of(input, sizes, strides)
 
 
 def flatten(input: Tensor, start_dim: int = 0, end_dim: int = -1) -> Tensor:
@@ -146,9 +174,17 @@ def select(input: Tensor, dim: int, index: int) -> Tensor:
 
 
 def unbind(input: Tensor, dim: int = 0) -> tuple[Tensor, ...]:
+    axis_of(dim, input.ndim)
     if not input.ndim:
         raise IndexError("Dimension specified as 0 but tensor has no dimensions")
-    return tuple(select(input, dim, i) for i in range(input.shape[axis_of(dim, input.ndim)]))
+    return _of_several("Unbind", [select(input, dim, i) for i in range(input.shape[axis_of(dim, input.ndim)])])
+
+
+def _of_several(name: str, views: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    """Views that were made at once, none of which may be written to while steps are recorded."""
+    for number, view in enumerate(views):
+        view.one_of = f"{number} of {name}"
+    return tuple(views)
 
 
 def split(input: Tensor, split_size_or_sections: Any, dim: int = 0) -> tuple[Tensor, ...]:
@@ -164,7 +200,7 @@ def split(input: Tensor, split_size_or_sections: Any, dim: int = 0) -> tuple[Ten
             f" split_sizes={list(sizes)}"
         )
     starts = [sum(sizes[:i]) for i in range(len(sizes))]
-    return tuple(narrow(input, dim, start, size) for start, size in zip(starts, sizes, strict=True))
+    return _of_several("Split", [narrow(input, dim, start, size) for start, size in zip(starts, sizes, strict=True)])
 
 
 def chunk(input: Tensor, chunks: int, dim: int = 0) -> tuple[Tensor, ...]:
