@@ -42,6 +42,7 @@ class Engine {
   #worker = new Worker(URL.createObjectURL(new Blob([workerText], {type: "text/javascript"})));
   #waiting = new Map();
   #asked = 0;
+  #ended; // why, once it has
 
   constructor(chapter) {
     this.chapter = chapter;
@@ -59,6 +60,7 @@ class Engine {
 
   #ask(task, given) {
     return new Promise((resolve, reject) => {
+      if (this.#ended) throw this.#ended;
       const id = ++this.#asked;
       this.#waiting.set(id, {resolve, reject});
       this.#worker.postMessage({id, task, ...given});
@@ -70,6 +72,7 @@ class Engine {
   }
 
   end(reason) {
+    this.#ended = reason;
     this.#worker.terminate();
     this.#waiting.forEach(({reject}) => reject(reason));
   }
@@ -100,6 +103,7 @@ async function one(chapter, name, source, others, told) {
     if (error instanceof Stopped) return {state: "timeout", misconceptions: [], message: error.message};
     if (engine === own) engine = undefined; // the next check tries anew
     own.end(error);
+    if (own.runs) return {state: "error", misconceptions: [], message: `It ends Python itself: ${error.message.trim().split("\n").at(-1)}`};
     throw error;
   } finally {
     clearTimeout(clock);

@@ -110,7 +110,7 @@ function Answer(cell, name) {
 }
 
 // The verdict as the notebook shows it, whose words come with it.
-function box(name, {state, message, headline = `Stopped: ${name}`, lines = message.split("\n"), ticks = [], printed = ""}) {
+function box(name, {state, message, headline = `${state === "error" ? "It stops with an error" : "Stopped"}: ${name}`, lines = message.split("\n"), ticks = [], printed = ""}) {
   const mark = {correct: "✓", not_implemented: "…"}[state] ?? "✗";
   return element("div", {className: "course-check", dataset: {state}},
     element("strong", {}, `${mark} ${headline}`),

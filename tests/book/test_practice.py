@@ -118,6 +118,23 @@ def test_an_endless_loop_is_stopped_and_the_page_lives_on(visit, name):
     assert verdict(visit.page).startswith("✓ Passed: compute_gae")
 
 
+def test_what_ends_python_is_told_and_the_page_lives_on(visit, name):
+    deep = "def compute_gae(*args, **kwargs):\n    return compute_gae(*args, **kwargs)\n"
+    for source in (deep, "import os\nos._exit(1)\n", "raise KeyboardInterrupt\n"):
+        answer = visit.page.evaluate("source => coursePractice.check('compute_gae', source)", source)
+        assert answer["state"] == "error" and answer["message"], source
+    assert visit.page.evaluate("source => coursePractice.check('compute_gae', source)", RIGHT)["state"] == "correct"
+
+
+def test_what_is_stopped_while_it_starts_can_be_checked_again(browser, html, name):
+    with Visit(browser, html / f"{PAGE}.html") as visit:
+        write(visit.page, RIGHT)
+        click = "document.querySelector('[aria-label=\"%s compute_gae\"]').click()"
+        visit.page.evaluate(f"{click % 'Check'}, requestAnimationFrame(() => {click % 'Stop'})")
+        assert "You stopped it." in told(visit.page)
+        assert verdict(visit.page).startswith("✓ Passed: compute_gae")
+
+
 def test_what_is_written_survives_a_reload(visit, name):
     write(visit.page, WRONG + "# mine")
     visit.page.reload()
