@@ -67,7 +67,7 @@ def for_book(chapter: Chapter, outputs: Outputs, with_solutions: bool = True, so
     executed = _outputs(chapter, outputs)
 
     def stub(key: str, cell: Cell) -> Iterator[NotebookNode]:
-        yield _code(key, cell.source)
+        yield _code(key, cell.source, [f"exercise-{cell.exercise}"])  # a class by which practice in the page finds it
         yield _code(_test_key(chapter, cell), f"check({cell.exercise})", outputs=executed[key])
         if with_solutions:
             yield _markdown(f"{key}-reference", _folded(solutions[str(cell.exercise)]))

@@ -213,7 +213,9 @@ class Keys(kept.Keys):
 
     @functools.cached_property
     def _page(self) -> str:
-        digest = hashlib.sha256(self.code.reach(RESTS_ON).fingerprint.encode() + PROCESS.read_bytes() + Path(__file__).read_bytes())
+        digest = hashlib.sha256(
+            self.code.reach(RESTS_ON).fingerprint.encode() + PROCESS.read_bytes() + Path(__file__).read_bytes()
+        )
         for name, path in files().items():
             digest.update(name.encode() + path.read_bytes())
         return digest.hexdigest()

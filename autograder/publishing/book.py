@@ -33,6 +33,7 @@ from autograder.authoring.chapter import Chapter, all_chapters
 from autograder.paths import BIBLIOGRAPHY, ROOT, RUNS
 from autograder.proving.dependencies import PACKAGES
 from autograder.proving.locks import one_at_a_time
+from autograder.publishing import in_page
 from autograder.publishing.execution import (
     BookError,
     cache_folder,
@@ -115,7 +116,7 @@ def staged_files(chapters: list[Chapter], with_solutions: bool) -> dict[str, byt
         files |= _kept(name, keys[chapter.assignment], functools.partial(_staged, chapter, with_solutions))
     files |= _kept("staged-kill-matrix", keys["kill-matrix"], functools.partial(_staged_kill_matrix, chapters))
     files |= _kept("staged-practice", keys["practice"], functools.partial(_staged_practice, chapters))
-    return files | assets()
+    return files | assets() | practice_files(chapters, files, with_solutions, keys)
 
 
 def _staged(chapter: Chapter, with_solutions: bool) -> tuple[dict[str, bytes], bool]:
@@ -156,8 +157,9 @@ def _kept(name: str, key: str, make: Callable[[], tuple[dict[str, bytes], bool]]
 
 
 def _stage_keys(chapters: list[Chapter], with_solutions: bool) -> dict[str, str]:
-    """Of each chapter, and of the kill matrix, a hash of all that its part of the stage rests on: for a chapter its own text and outputs,
-    the names of pages and exercises in all others, and all code, as references and checks may take anything from it."""
+    """Of each chapter, of the kill matrix, and of what pages can judge, a hash of all that its part of the stage rests on: for a chapter
+    its own text and outputs, the names of pages and exercises in all others, and all code, as references and checks may take anything
+    from it."""
     code = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
     common = content_hash((), [*code, BIBLIOGRAPHY, ROOT / "requirements.txt", ROOT / "constraints.txt"])
     names = [f"{chapter.page} {[cell.exercise for cell in chapter.exercises]}" for chapter in chapters]
@@ -167,10 +169,11 @@ def _stage_keys(chapters: list[Chapter], with_solutions: bool) -> dict[str, str]
     }
     titles = [f"{chapter.number}. {chapter.title}" for chapter in chapters]
     records = [BOOK / "kill-matrix.md", *kept_records(), *RUNS.glob("*/*.parquet")]
-    judging = [path for path in sorted((BOOK / "practice").rglob("*")) if path.suffix in (".py", ".md")] + [BOOK / "practice.md"]
+    judging = content_hash((), sorted((BOOK / "practice").rglob("*.py")))
     return keys | {
         "kill-matrix": content_hash([common, *titles], records),
-        "practice": content_hash([common, *titles, *keys.values()], [*kept_records(), *judging]),
+        "practice": content_hash([common, judging, *titles, *keys.values()], [*kept_records(), BOOK / "practice.md"]),
+        "judging": judging,
     }
 
 
@@ -194,6 +197,31 @@ def staged_chapter(chapter: Chapter, outputs: assemble.Outputs, with_solutions: 
     page.cells[0].source += f"\n- **Notebook:** {{download}}`{name} <downloads/{name}>`"
     files = {f"{docname(chapter)}.ipynb": page, f"chapters/downloads/{name}": student}
     return {path: nbformat.writes(notebook).encode() for path, notebook in files.items()}
+
+
+def practice_files(
+    chapters: list[Chapter], files: dict[str, bytes], with_solutions: bool, keys: dict[str, str] | None = None
+) -> dict[str, bytes]:
+    """What practice in the pages of these chapters needs, of which `files` has the notebooks. With `keys` (`_stage_keys`), what chapters
+    hand to their pages is kept from one build to the next."""
+    if in_page.fetched() is None:
+        return in_page.staged([], {})
+    pages = []
+    for chapter in chapters:
+        make = functools.partial(_staged_page, chapter, with_solutions)
+        if keys:
+            key = content_hash([keys[chapter.assignment], keys["judging"]], kept_records())
+            name = f"practice-of-{chapter.assignment}-{'solved' if with_solutions else 'unsolved'}"
+            [content] = _kept(name, key, make).values()
+        else:
+            [content] = make()[0].values()
+        pages.append((chapter, json.loads(content)))
+    notebooks = {chapter.assignment: files[f"chapters/downloads/{chapter.assignment}.ipynb"] for chapter in chapters}
+    return in_page.staged(pages, notebooks)
+
+
+def _staged_page(chapter: Chapter, with_solutions: bool) -> tuple[dict[str, bytes], bool]:
+    return {chapter.assignment: json.dumps(in_page.handed_to(chapter, with_solutions)).encode()}, True
 
 
 def docname(chapter: Chapter) -> str:
@@ -357,6 +385,7 @@ class Renderer:
     def render(self, stage: Path, work: Path, chapters: list[Chapter]) -> None:
         """Build `stage` into `work`. Raises: BookError with every warning, told of the sources of these chapters."""
         options = ["--config", str(ROOT / "_config.yml"), "--path-output", str(work), "-W", "-n", "--keep-going", "-q"]
+        _rewrite_pages_of_other_assets(stage / "vendor", work / "_build" / "html")
         _, complaints = self._process.communicate(json.dumps(["build", str(stage), *options]))
         if self._process.returncode != 0:
             shutil.rmtree(work, ignore_errors=True)  # Sphinx would not repeat a warning about a page that it has read already
@@ -371,6 +400,16 @@ class Renderer:
         if self._process.returncode is None:
             self._process.kill()
             self._process.communicate()
+
+
+def _rewrite_pages_of_other_assets(assets: Path, html: Path) -> None:
+    """Make Sphinx write all pages if an asset is newer than one of them: it copies assets only where it writes, and pages name their
+    checksums."""
+    pages = list(html.rglob("*.html"))
+    newest = max((path.stat().st_mtime for path in assets.rglob("*")), default=0)
+    if any(page.stat().st_mtime < newest for page in pages):
+        for page in pages:
+            os.utime(page, (0, 0))
 
 
 def publish(html: Path, out: Path) -> None:
@@ -405,7 +444,9 @@ def _build_key(chapters: list[Chapter], with_solutions: bool) -> str:
     kept = [*kept_records(), ROOT / "requirements.txt", ROOT / "constraints.txt"]
     chapters_own = [chapter.path for chapter in chapters]
     outputs = [execution_key(chapter) for chapter in chapters]
-    return content_hash([str(with_solutions), *outputs], [*own, *code, *kept, ROOT / "_config.yml", *chapters_own])
+    return content_hash(
+        [str(with_solutions), in_page.fingerprint(), *outputs], [*own, *code, *kept, ROOT / "_config.yml", *chapters_own]
+    )
 
 
 def kept_records() -> list[Path]:

@@ -52,7 +52,8 @@ def staged_files(own: Chapter, with_solutions: bool) -> dict[str, bytes]:
     files["kill-matrix.md"] = book.kill_matrix_page({f"{own.number}. {own.title}": book.kill_rows(own)}).encode()
     files["_toc.yml"] = yaml.safe_dump(book.table_of_contents(chapters), sort_keys=False, allow_unicode=True).encode()
     files["references.bib"] = (book.BOOK / "references.bib").read_bytes()
-    return files | book.staged_chapter(own, executed_outputs(own), with_solutions) | book.assets()
+    files |= book.staged_chapter(own, executed_outputs(own), with_solutions) | book.assets()
+    return files | book.practice_files([own], files, with_solutions)
 
 
 def _stub(title: str) -> bytes:

@@ -15,7 +15,7 @@ from autograder.authoring import assemble
 from autograder.authoring.chapter import parse
 from autograder.authoring.contract import references
 from autograder.paths import ROOT
-from autograder.publishing import book, execution, practice_page
+from autograder.publishing import book, execution, in_page, practice_page
 
 HOW_TO_PAGES = sorted((ROOT / "book" / "how-to").glob("*.md"))
 
@@ -385,6 +385,7 @@ def bare(tiny, tmp_path_factory):
         patch.setattr(book, "run_all", lambda chapters, first: None)
         patch.setattr(book, "kill_rows", lambda chapter, keys: [])
         patch.setattr(practice_page, "practice_rows", lambda chapter, keys: [])
+        patch.setattr(in_page, "fetched", lambda: None)
         patch.setattr(book, "_build_key", lambda chapters, with_solutions: "tiny")
         patch.setattr(
             book, "_stage_keys", lambda chapters, with_solutions: dict.fromkeys(("ch98", "ch99", "kill-matrix"), "tiny")

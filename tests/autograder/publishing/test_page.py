@@ -10,7 +10,7 @@ from nbformat.v4 import new_notebook
 
 from autograder import paths
 from autograder.authoring import assemble, chapter, contract
-from autograder.publishing import book, located, page
+from autograder.publishing import book, in_page, located, page
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +43,7 @@ def workshop(tiny, tmp_path_factory):
         patch.setattr(book, "BOOK", folder / "book")
         patch.setattr(book, "STAGE", folder / "stage")
         patch.setattr(book, "kill_rows", lambda own: [{"exercise": "double", "unproved": "Never proved."}])
+        patch.setattr(in_page, "fetched", lambda: None)
         patch.setattr(assemble, "real_sources", tiny.sources)
         build.folder, build.ran = folder, ran
         yield build
