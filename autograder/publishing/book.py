@@ -157,9 +157,9 @@ def _kept(name: str, key: str, make: Callable[[], tuple[dict[str, bytes], bool]]
 
 
 def _stage_keys(chapters: list[Chapter], with_solutions: bool) -> dict[str, str]:
-    """Of each chapter, of the kill matrix, and of what pages can judge, a hash of all that its part of the stage rests on: for a chapter
-    its own text and outputs, the names of pages and exercises in all others, and all code, as references and checks may take anything
-    from it."""
+    """Of each chapter, of the kill matrix, of what pages can judge, and of what they are handed for it, a hash of all that its part of
+    the stage rests on: for a chapter its own text and outputs, the names of pages and exercises in all others, and all code, as
+    references and checks may take anything from it."""
     code = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
     common = content_hash((), [*code, BIBLIOGRAPHY, ROOT / "requirements.txt", ROOT / "constraints.txt"])
     names = [f"{chapter.page} {[cell.exercise for cell in chapter.exercises]}" for chapter in chapters]
@@ -169,11 +169,12 @@ def _stage_keys(chapters: list[Chapter], with_solutions: bool) -> dict[str, str]
     }
     titles = [f"{chapter.number}. {chapter.title}" for chapter in chapters]
     records = [BOOK / "kill-matrix.md", *kept_records(), *RUNS.glob("*/*.parquet")]
-    judging = content_hash((), sorted((BOOK / "practice").rglob("*.py")))
+    cells = [cell.source for chapter in chapters for cell in chapter.cells if cell.kind == "code"]
+    judging = content_hash([common, *cells], [*sorted((BOOK / "practice").rglob("*.py")), *kept_records()])
     return keys | {
         "kill-matrix": content_hash([common, *titles], records),
-        "practice": content_hash([common, judging, *titles, *keys.values()], [*kept_records(), BOOK / "practice.md"]),
-        "judging": judging,
+        "practice": content_hash([judging, *titles], [BOOK / "practice.md"]),
+        "handed": content_hash([judging, str(with_solutions)], []),
     }
 
 
@@ -210,9 +211,8 @@ def practice_files(
     for chapter in chapters:
         make = functools.partial(_staged_page, chapter, with_solutions)
         if keys:
-            key = content_hash([keys[chapter.assignment], keys["judging"]], kept_records())
-            name = f"practice-of-{chapter.assignment}-{'solved' if with_solutions else 'unsolved'}"
-            [content] = _kept(name, key, make).values()
+            name = f"handed-to-{chapter.assignment}-{'solved' if with_solutions else 'unsolved'}"
+            [content] = _kept(name, keys["handed"], make).values()
         else:
             [content] = make()[0].values()
         pages.append((chapter, json.loads(content)))

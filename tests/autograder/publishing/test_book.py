@@ -315,7 +315,7 @@ def test_prose_makes_its_own_chapter_anew_and_no_other(stage_keys):
 def test_a_title_is_in_the_kill_matrix_too_and_an_exercise_concerns_all_chapters(stage_keys):
     before = stage_keys()
     titled, named = stage_keys("A tiny chapter", "A small chapter"), stage_keys("exercise: double", "exercise: twofold")
-    assert {name for name, key in titled.items() if key != before[name]} == {"ch99", "kill-matrix"}
+    assert {name for name, key in titled.items() if key != before[name]} == {"ch99", "kill-matrix", "practice"}
     assert {name for name, key in named.items() if key != before[name]} == {"ch98", "ch99"}
 
 
@@ -328,11 +328,11 @@ def test_code_and_pins_make_the_whole_stage_anew(stage_keys, elsewhere, file):
 
 def test_outputs_and_the_edition_make_a_chapter_anew_and_a_record_the_kill_matrix(stage_keys, elsewhere):
     before = stage_keys()
-    assert {name for name, key in stage_keys(with_solutions=False).items() if key != before[name]} == {"ch98", "ch99"}
+    assert {name for name, key in stage_keys(with_solutions=False).items() if key != before[name]} == {"ch98", "ch99", "handed"}
     (elsewhere / "ch98.ipynb").write_text("other outputs")
     (elsewhere / "autograder/proving/records").mkdir(parents=True)
     (elsewhere / "autograder/proving/records/ch99.json").write_text("{}")
-    assert {name for name, key in stage_keys().items() if key != before[name]} == {"ch98", "kill-matrix"}
+    assert {name for name, key in stage_keys().items() if key != before[name]} == {"ch98", "kill-matrix", "practice", "handed"}
 
 
 def test_a_part_of_the_stage_is_made_once_unless_it_must_not_be_kept(tmp_path, monkeypatch):
@@ -388,7 +388,9 @@ def bare(tiny, tmp_path_factory):
         patch.setattr(in_page, "fetched", lambda: None)
         patch.setattr(book, "_build_key", lambda chapters, with_solutions: "tiny")
         patch.setattr(
-            book, "_stage_keys", lambda chapters, with_solutions: dict.fromkeys(("ch98", "ch99", "kill-matrix"), "tiny")
+            book,
+            "_stage_keys",
+            lambda chapters, with_solutions: dict.fromkeys(("ch98", "ch99", "kill-matrix", "practice", "handed"), "tiny"),
         )
         patch.setattr(book, "cache_folder", lambda: folder)
         patch.setattr(book, "STAGE", folder / "stage")
