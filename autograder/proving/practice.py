@@ -35,6 +35,7 @@ LIBRARY = (
     "checks/diagnosis.py",
     "checks/observing.py",
     "checks/results.py",
+    "checks/telling.py",
 )
 RESTS_ON = ("autograder.authoring.freeze:visible", "course_lib.checks.results:examined")  # beside this module and the page's own
 ELSEWHERE = ("is not in the page; it is in the notebook", "is not in the page's torch; it is in the notebook")

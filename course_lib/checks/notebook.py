@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from course_lib.checks import magics, names, syntax
+from course_lib.checks.telling import text_of
 
 
 class NotebookError(ValueError):
@@ -126,14 +127,6 @@ def needed(stops: Mapping[Any, Stop], exercise: str, uses: Iterable[str], messag
     missing = {name for found in NAMED.findall(message) for name in found if name}
     wanted = {exercise, *uses, *missing} | ({"*"} if missing else set())
     return [key for key in sorted(stops) if wanted & set(stops[key].sets)]
-
-
-def text_of(error: BaseException) -> str:
-    """What the exception says, or nothing if it refuses to say it."""
-    try:
-        return str(error)[:500]
-    except BaseException:
-        return ""
 
 
 def run_cells(cells: Sequence[dict[str, Any]], namespace: dict[str, Any]) -> dict[int, Exception | SystemExit]:

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 
 from course_lib.checks.cases import Observation
-from course_lib.checks.notebook import text_of
+from course_lib.checks.telling import text_of
 
 MAX_ENTRIES = 10_000
 """Of an iterator that never ends, so many entries are taken."""
@@ -130,6 +130,8 @@ def _leaves(value: Any, path: str = "") -> list[tuple[str, Any]]:
 def _array(leaf: torch.Tensor | float) -> torch.Tensor:
     """The entries, as they are now; an integer beyond 64 bits becomes a float, the largest if need be."""
     if isinstance(leaf, torch.Tensor):
+        if type(leaf) is not torch.Tensor:  # a learner's subclass, whose operations may do anything
+            leaf = torch.tensor(leaf.tolist(), dtype=leaf.dtype).reshape(tuple(leaf.shape))
         leaf = leaf.detach().cpu()
         return leaf.float() if leaf.dtype in (torch.bfloat16, torch.float16) else leaf.clone()
     kind = torch.bool if isinstance(leaf, bool) else torch.int64 if isinstance(leaf, int) and abs(leaf) < 2**63 else torch.float64
