@@ -42,7 +42,8 @@ def matmul(input: Tensor, other: Tensor) -> Tensor:
         )
     if input.dtype is not other.dtype:
         raise RuntimeError(f"expected m1 and m2 to have the same dtype, but got: {input.dtype.c_name} != {other.dtype.c_name}")
-    if input.dtype.category == 0 and count(a.shape) and count(b.shape):
+    vectors = input.ndim == other.ndim == 1
+    if input.dtype.category == 0 and (vectors or (count(a.shape) and count(b.shape))):
         raise NotImplementedError(f"\"addmm_impl_cpu_\" not implemented for '{input.dtype.long_name}'")
     batch = broadcast_shapes(a.shape[:-2], b.shape[:-2])
     result = _batched(a.expand(*batch, *a.shape[-2:]), b.expand(*batch, *b.shape[-2:]))
