@@ -10,6 +10,7 @@ import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import IO
 
 from autograder.grading.names import is_junk
 
@@ -17,6 +18,8 @@ MAX_ARCHIVE = 200 << 20
 MAX_ENTRIES = 20_000
 MAX_DIRECTORY = 8 << 20  # bytes of the list of entries
 _END = struct.Struct("<4s4H2LH")
+_END64 = struct.Struct("<4sQ2H2L4Q")
+_LOCATOR = 20  # bytes
 _CHUNK = 1 << 20
 
 
@@ -103,15 +106,46 @@ def _plain(info: zipfile.ZipInfo) -> str | None:
 
 def _check_directory(content: bytes) -> None:
     """Raise BadArchive for a list of entries of unreasonable size, before anything makes objects of it."""
-    start = len(content) - _END.size
-    if start < 0:
-        raise BadArchive("is a damaged zip archive")
-    if content[start : start + 4] != b"PK\5\6" or content[-2:] != b"\0\0":
-        start = content.rfind(b"PK\5\6", max(start - (1 << 16) - 1, 0))
-        if start < 0 or start + _END.size > len(content):
-            raise BadArchive("is a damaged zip archive")
-    if content[max(start - 20, 0) : start].startswith(b"PK\6\7"):
+    listed = listing(io.BytesIO(content))
+    if listed.is_huge:
         raise BadArchive("is a zip archive of the kind for huge files: hand in the notebook itself")
-    *_, entries, size, _offset, _comment = _END.unpack(content[start : start + _END.size])
-    if entries > MAX_ENTRIES or size > MAX_DIRECTORY:
+    if listed.entries > MAX_ENTRIES or listed.size > MAX_DIRECTORY:
         raise BadArchive(f"is a zip archive of more than {MAX_ENTRIES} entries")
+
+
+@dataclass(frozen=True)
+class Listing:
+    """How many entries a zip's list has, how many bytes that takes, and whether it is of the kind for huge files (zip64)."""
+
+    entries: int
+    size: int
+    is_huge: bool
+
+
+def listing(stream: IO[bytes]) -> Listing:
+    """What the end of a zip says about its list, which `zipfile` reads whole before anybody can look. Raises BadArchive.
+
+    The end is looked for where zipfile looks. Of a zip64 record, which different versions of it find by place or by reference, the
+    larger numbers count.
+    """
+    length = stream.seek(0, os.SEEK_END)
+    begin = max(0, length - _END.size - (1 << 16) - _LOCATOR - _END64.size)
+    stream.seek(begin)
+    tail = stream.read()
+    at = len(tail) - _END.size
+    if at >= 0 and not (tail[at : at + 4] == b"PK\5\6" and tail[-2:] == b"\0\0"):
+        at = tail.rfind(b"PK\5\6")
+    if at < 0 or at + _END.size > len(tail):
+        raise BadArchive("is a damaged zip archive")
+    *_, entries, size, _offset, _comment = _END.unpack_from(tail, at)
+    locator = at - _LOCATOR
+    if locator < 0 or tail[locator : locator + 4] != b"PK\6\7":
+        return Listing(entries, size, False)
+    (reference,) = struct.unpack_from("<Q", tail, locator + 8)
+    for place in (begin + locator - _END64.size, reference):
+        if 0 <= place <= length - _END64.size:
+            stream.seek(place)
+            mark, *_, here, bytes_here, _offset = _END64.unpack(stream.read(_END64.size))
+            if mark == b"PK\6\6":
+                entries, size = max(entries, here), max(size, bytes_here)
+    return Listing(entries, size, True)

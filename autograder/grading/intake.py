@@ -23,7 +23,7 @@ from autograder.grading.reading import MAX_CELLS, MAX_NOTEBOOK, MAX_RAW, BadNote
 
 __all__ = [
     "MAX_CELLS", "MAX_ENTRIES", "MAX_NOTEBOOK", "MAX_PATH", "MAX_RAW", "MAX_SIDE_BYTES", "MAX_SIDE_FILES", "BadFile", "BadNotebook",
-    "Submission", "Survey", "discover", "grade_ids", "parse", "read", "read_regular", "survey",
+    "Submission", "Survey", "grade_ids", "parse", "read", "read_regular", "survey",
 ]  # fmt: skip
 
 Task = tuple[str, str, Path]
@@ -60,11 +60,6 @@ class Survey:
     """What was seen and not understood, and what it would take, a line each."""
     wrong_level: bool = False
     """Whether this is plainly not the folder of the students, and nothing in it is to be graded."""
-
-
-def discover(submitted: Path) -> list[Task]:
-    """Every (student, assignment, folder) under `submitted`, sorted; names that begin with a dot are no submissions."""
-    return survey(submitted, ()).tasks
 
 
 def survey(submitted: Path, assignments: Iterable[str]) -> Survey:

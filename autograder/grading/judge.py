@@ -495,10 +495,8 @@ def _failed(exercise: FrozenExercise, state: str, message: str) -> Finding:
 
 def _last_definition(name: str, cells: Sequence[tuple[int, str]]) -> int:
     """The position of the last cell that defines `name`, as text (a hostile cell is not worth parsing); -1 if none does."""
-    # [ \t], for \s would run on over empty lines, from every one of them: a cell of nothing else would take for ever
-    defines = rf"(?:async\s+)?def\s+{name}\s*[(\[]|class\s+{name}\b|{name}\s*(?::[^=\n]*)?=[^=]"
-    defines += rf"|(?:from[ \t]+\S+[ \t]+)?import[ \t][^\n]*\b{name}\b"
-    pattern = re.compile(rf"^[ \t]*(?:>>>[ \t]*|In \[\d+\]: )?(?:{defines})", re.MULTILINE)
+    imports = rf"(?:from[ \t]+\S+[ \t]+)?import[ \t][^\n]*\b{name}\b"
+    pattern = re.compile(rf"^[ \t]*{repair.PROMPT}(?:{repair.defining(name)}|{imports})", re.MULTILINE)
     return max((position for position, (_, source) in enumerate(cells) if pattern.search(source)), default=-1)
 
 

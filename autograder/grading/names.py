@@ -18,8 +18,8 @@ _JUNK_FOLDERS = {"node_modules", "site-packages", "lightning_logs", "mlruns", "w
 
 
 def is_junk(name: str) -> bool:
-    """What operating systems and Python leave beside anybody's work; and what is hidden."""
-    return name.startswith(".") or name.casefold() in _JUNK
+    """What operating systems, editors and Python leave beside anybody's work; and what is hidden."""
+    return name.startswith((".", "~$")) or name.casefold() in _JUNK
 
 
 def is_junk_file(name: str) -> bool:
@@ -39,8 +39,8 @@ def label(name: str) -> str:
     try:
         return plain_name(name)
     except ValueError:
-        readable = "".join(character if character.isprintable() else "_" for character in clean_text(name, 100))
-        return f"{readable}-{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
+        readable = "".join(one if one.isprintable() and one not in "/\\" else "_" for one in clean_text(name, 100)).lstrip(".")
+        return f"{readable or 'unnamed'}-{hashlib.sha256(name.encode(errors='surrogatepass')).hexdigest()[:8]}"
 
 
 def notebook_rank(name: str, assignment: str) -> int | None:

@@ -103,13 +103,19 @@ def resembles(source: str, released: str) -> bool:
 # -------------------------------------------------------------------------------- definitions, as text
 
 
-def defines(name: str) -> re.Pattern[str]:
-    """Where a source seems to define `name` outside of any function: what follows the name tells a def from anything else."""
+PROMPT = r"(?:>>>[ \t]*|In \[\d+\]: )?"
+
+
+def defining(name: str) -> str:
+    """A pattern of what defines `name`, from the start of its line: what follows the name tells a def from anything else."""
     name = re.escape(name)
-    prompt = r"(?:>>>[ \t]*|In \[\d+\]: )?"
-    return re.compile(
-        rf"^{prompt}(?:(?:async[ \t]+)?def[ \t]+{name}[ \t]*\(|class[ \t]+{name}\b|{name}[ \t]*(?::[^=\n]*)?=[^=])", re.MULTILINE
-    )
+    # [ \t], for \s would run on over empty lines, from every one of them: a cell of nothing else would take for ever
+    return rf"(?:async[ \t]+)?def[ \t]+{name}[ \t]*[(\[]|class[ \t]+{name}\b|{name}[ \t]*(?::[^=\n]*)?=[^=]"
+
+
+def defines(name: str) -> re.Pattern[str]:
+    """Where a source seems to define `name` outside of any function."""
+    return re.compile(rf"^{PROMPT}(?:{defining(name)})", re.MULTILINE)
 
 
 def _defined_in(source: str, name: str) -> bool:

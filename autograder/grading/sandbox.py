@@ -362,9 +362,14 @@ def _sockets(process: psutil.Process) -> int:
 
 PROBE = """
 import socket, sys
-if {torch}:
-    import torch
-socket.socket(fileno=int(sys.argv[1])).sendall((2).to_bytes(8, "big") + b"ok")
+answer = "ok"
+try:
+    if {torch}:
+        import torch
+except BaseException as error:
+    answer = f"{{type(error).__name__}}: {{error}}"
+frame = answer.encode()
+socket.socket(fileno=int(sys.argv[1])).sendall(len(frame).to_bytes(8, "big") + frame)
 """
 
 
@@ -375,11 +380,14 @@ def probe(torch: bool = False) -> list[Problem]:
         script.write_text(PROBE.format(torch=torch))
         try:
             with Sandbox(script) as sandbox:
-                sandbox.receive(timeout=START_TIMEOUT)
+                answer = sandbox.receive(timeout=START_TIMEOUT).decode()
         except SandboxUnavailable as error:
             return [Problem("no sandbox", str(error))]
         except SandboxError as error:
-            return [Problem(f"import torch fails inside the sandbox: {error}", "Install requirements.txt into this environment.")]
+            answer = str(error)
+    if answer != "ok":
+        what = f"import torch fails inside the sandbox: {answer[:500]}"
+        return [Problem(what, "Install requirements.txt into this environment.")]
     return []
 
 

@@ -18,7 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
+from autograder.grading import archives as learners_archives
 from autograder.grading import intake
+from autograder.grading.names import is_junk
 from autograder.grading.verdicts import clean_text
 
 MAX_FILE = 256 << 20  # bytes of one file
@@ -28,7 +30,6 @@ MAX_DEPTH = 20
 MAX_TOLD = 20  # refusals of one archive that get a line each
 BOMB_BYTES, BOMB_RATIO = 16 << 20, 200  # a larger file that shrinks to less than this share is one of nothing but repetition
 CHUNK = 1 << 20
-JUNK = {"__macosx", "thumbs.db", "desktop.ini", "__pycache__"}
 REPOSITORY = ".git"  # the one hidden name that tells something
 
 
@@ -112,7 +113,7 @@ def _of_folder(folder: Path, problems: list[str]) -> Iterator[Entry]:
             path = f"{parent}/{entry.name}" if parent else entry.name
             if entry.name == REPOSITORY:
                 yield Entry(f"{path}/HEAD", 0, _opener(Path(os.devnull)))
-            if _is_junk(entry.name):
+            if is_junk(entry.name):
                 continue
             if entry.is_dir(follow_symlinks=False):
                 if path.count("/") < MAX_DEPTH:
@@ -179,23 +180,12 @@ def _member_opener(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Callabl
 
 
 def _check_directory(stream: IO[bytes]) -> None:
-    """Refuse a zip whose table of contents would not fit: `zipfile` reads it whole, before anybody can look."""
-    size = stream.seek(0, os.SEEK_END)
-    start = max(0, size - 66_000)  # the end's record is 22 bytes, and a comment of at most 65,535 follows it
-    stream.seek(start)
-    tail = stream.read()
-    at = tail.rfind(b"PK\x05\x06")
-    if at < 0 or len(tail) < at + 22:
-        raise Refused("is no zip (if it is an archive of another kind, unpack it and give the folder)")
-    count, length = struct.unpack_from("<HI", tail, at + 10)
-    if count == 0xFFFF or length == 0xFFFFFFFF:  # the numbers are in zip64's record
-        locator = tail.rfind(b"PK\x06\x07", 0, at)
-        place = struct.unpack_from("<Q", tail, locator + 8)[0] if locator >= 0 else size
-        stream.seek(min(place, size))
-        record = stream.read(56)
-        if len(record) == 56 and record[:4] == b"PK\x06\x06":
-            count, length = struct.unpack_from("<QQ", record, 32)
-    if count > MAX_ENTRIES or length > MAX_DIRECTORY:
+    """Refuse a zip whose table of contents would not fit."""
+    try:
+        listed = learners_archives.listing(stream)
+    except learners_archives.BadArchive:
+        raise Refused("is no zip (if it is an archive of another kind, unpack it and give the folder)") from None
+    if listed.entries > MAX_ENTRIES or listed.size > MAX_DIRECTORY:
         raise Refused(f"has more than {MAX_ENTRIES} entries")
     stream.seek(0)
 
@@ -221,16 +211,11 @@ def _safe_path(name: str) -> str | None:
         raise Refused(f"lies more than {MAX_DEPTH} folders deep, or has a name of more than {intake.MAX_PATH} bytes")
     if REPOSITORY in parts:
         return "/".join([*parts[: parts.index(REPOSITORY) + 1], "HEAD"])
-    if not parts or any(_is_junk(part) for part in parts):
+    if not parts or any(is_junk(part) for part in parts):
         return None
     if any(_clean(part) != part for part in parts):
         raise Refused("has a name that can't be written down")
     return unicodedata.normalize("NFC", "/".join(parts))
-
-
-def _is_junk(name: str) -> bool:
-    """What systems and editors leave behind, hidden names included: as in SUBMITTED, nobody hands that in."""
-    return name.startswith((".", "~$")) or name.casefold() in JUNK
 
 
 def _clean(name: str) -> str:

@@ -28,6 +28,7 @@ from rich.text import Text
 from autograder.authoring import chapter
 from autograder.grading import deadlines
 from autograder.grading.deadlines import Deadlines
+from autograder.grading.names import label
 from autograder.grading.verdicts import clean_text, write_atomically
 from autograder.platforms import archives, attempts, downloads, roster
 from autograder.platforms.archives import Entry, Refused
@@ -39,7 +40,6 @@ SCHEMA = 1
 PEOPLES_IDS = ("canvas", "moodle")  # where an id is a person's, and names are what people are called
 NOTEBOOK = re.compile(r"\.ipynb(?:\.json|\.txt)?$", re.I)
 COPIED = re.compile(r"^copy of | ?\(\d+\)$|-\d+$|-copy\d*$|_\d+$", re.I)  # what systems add to a name that is taken
-ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar", ".xz", ".bz2")
 
 
 class CollectError(ValueError):
@@ -231,11 +231,11 @@ class _Sorting:
             shown = one.student or one.login or one.name or one.platform_id or one.download
             if one.unknown:
                 shown = one.download.rpartition("/")[2]
-            default = roster.label(shown)
+            default = label(shown.strip())
             if one.platform_id and one.platform in PEOPLES_IDS and not mapped:
                 platform, number = owners.setdefault(default, (one.platform, one.platform_id))
                 if platform == one.platform and number != one.platform_id:
-                    default = roster.label(f"{shown}-{one.platform_id}")
+                    default = label(f"{shown}-{one.platform_id}".strip())
             labels[one.person] = mapped or default
             if self.people and not mapped and not one.unknown:
                 told = ", ".join(filter(None, (one.platform_id, one.login, one.email, one.name)))
@@ -336,7 +336,7 @@ class _Sorting:
                 if one.trusts_timestamp and one.at:
                     continue  # written anew
                 path = "timestamp (handed in).txt"  # a time is what the platform says
-            path = "/".join(roster.label(part) for part in path.split("/"))
+            path = "/".join(label(part.strip()) for part in path.split("/"))
             stem, dot, end = path.rpartition(".") if "." in path.rpartition("/")[2] else (path, "", "")
             number = 2
             while path.casefold() in taken:

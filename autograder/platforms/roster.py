@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import io
-import os
 import re
 import unicodedata
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from autograder.grading.verdicts import clean_text, plain_name
+from autograder.grading.names import label
 
 COLUMNS = {
     "student": "student",
@@ -37,17 +35,6 @@ MAX_BYTES = 16 << 20
 
 class RosterError(ValueError):
     """The table can't be used; the message names file, line and cure."""
-
-
-def label(text: str) -> str:
-    """`text` as the name of a student's folder, NFC; what cannot be one keeps what can be read of it, and a hash."""
-    text = unicodedata.normalize("NFC", text).strip()
-    try:
-        return plain_name(text)
-    except ValueError:
-        readable = re.sub(r"[\s/\\]+", "_", clean_text(text, 100)).lstrip(".") or "student"
-        digest = hashlib.sha256(os.fsencode(text) if text.isprintable() else text.encode(errors="surrogatepass")).hexdigest()
-        return f"{readable}-{digest[:8]}"
 
 
 def _key(value: str) -> str:
@@ -125,7 +112,7 @@ def _filled(path: Path, kinds: list[str | None], rows: list[list[str]]) -> Roste
             if any(kind in values for kind in ("login", "email")) or ("id" in values and "name" not in values):
                 raise RosterError(f"{path}, line {number}: no student in it; fill in the column, or delete the line")
             continue  # a test student of Canvas has no login
-        student = label(values["student"])
+        student = label(values["student"].strip())
         if "submitted_at" in values:
             roster.times[student] = values["submitted_at"]
         for kind in KEYS:

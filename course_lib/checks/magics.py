@@ -50,75 +50,14 @@ ELSEWHERE = frozenset(
 )
 """Cell magics whose body is no Python, or none that runs in this process."""
 
-AUTOMAGICS = frozenset(
-    (
-        *(
-            "pip",
-            "conda",
-            "mamba",
-            "micromamba",
-            "uv",
-            "cd",
-            "ls",
-            "ll",
-            "la",
-            "lk",
-            "ldir",
-            "lx",
-            "dir",
-            "mkdir",
-            "rmdir",
-            "rm",
-            "cp",
-            "mv",
-        ),
-        *("cat", "more", "less", "man", "pwd", "pushd", "popd", "dirs", "env", "set_env", "matplotlib", "pylab", "load_ext"),
-        *(
-            "reload_ext",
-            "unload_ext",
-            "autoreload",
-            "config",
-            "precision",
-            "who",
-            "whos",
-            "who_ls",
-            "time",
-            "timeit",
-            "run",
-            "prun",
-        ),
-        *(
-            "reset",
-            "reset_selective",
-            "history",
-            "hist",
-            "store",
-            "debug",
-            "pdb",
-            "pinfo",
-            "psearch",
-            "pprint",
-            "xmode",
-            "colors",
-        ),
-        *(
-            "automagic",
-            "alias",
-            "logstart",
-            "logstop",
-            "logon",
-            "logoff",
-            "save",
-            "recall",
-            "rerun",
-            "system",
-            "sx",
-            "sc",
-            "magic",
-        ),
-        *("lsmagic", "quickref", "clear", "gui", "page", "pycat", "tb", "notebook", "connect_info", "qtconsole"),
-    )
-)
+AUTOMAGICS = frozenset((
+    "pip", "conda", "mamba", "micromamba", "uv", "cd", "ls", "ll", "la", "lk", "ldir", "lx", "dir", "mkdir", "rmdir", "rm", "cp",
+    "mv", "cat", "more", "less", "man", "pwd", "pushd", "popd", "dirs", "env", "set_env", "matplotlib", "pylab", "load_ext",
+    "reload_ext", "unload_ext", "autoreload", "config", "precision", "who", "whos", "who_ls", "time", "timeit", "run", "prun",
+    "reset", "reset_selective", "history", "hist", "store", "debug", "pdb", "pinfo", "psearch", "pprint", "xmode", "colors",
+    "automagic", "alias", "logstart", "logstop", "logon", "logoff", "save", "recall", "rerun", "system", "sx", "sc", "magic",
+    "lsmagic", "quickref", "clear", "gui", "page", "pycat", "tb", "notebook", "connect_info", "qtconsole",
+))  # fmt: skip
 """Magics and aliases that IPython takes without their `%`, in a cell of one line."""
 
 AUTOMAGIC = re.compile(r"\s*([a-z_]+)((?:\s+(?![=+*/<>&|^@%,.(\[-]).*|\s+--?\w.*)?)\s*")

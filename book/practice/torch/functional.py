@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Sequence
 from typing import Any
 
@@ -147,7 +148,25 @@ def binary_cross_entropy_with_logits(input: Tensor, target: Tensor, weight: Any 
 
 
 def binary_cross_entropy(input: Tensor, target: Tensor, weight: Any = None, reduction: str = "mean") -> Tensor:
-    losses = -(target * input.log().clamp(min=-100) + (1 - target) * (1 - input).log().clamp(min=-100))
+    if target.shape != input.shape:
+        raise ValueError(
+            f"Using a target size ({target.shape}) that is different to the input size ({input.shape}) is deprecated. "
+            "Please ensure they have the same size."
+        )
+    if not all(0 <= x <= 1 for x in input.flat()):
+        raise RuntimeError("all elements of input should be between 0 and 1")
+
+    least = array("f", [1e-12])[0]  # torch's bound on x (1 - x), which is in single precision there
+
+    def log(x: float, bound: float = -100.0) -> float:  # torch's bound, so that no loss is infinite
+        return max(math.log(x), bound) if x > 0 else bound
+
+    losses = entrywise(
+        "binary_cross_entropy",
+        lambda x, t: (t - 1) * log(1 - x) - t * log(x),
+        [lambda x, t, y: (x - t) / max((1 - x) * x, least), lambda x, t, y: log(1 - x, -math.inf) - log(x, -math.inf)],
+        [input, target],
+    )
     return _reduced(losses if weight is None else losses * weight, reduction)
 
 

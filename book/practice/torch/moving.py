@@ -136,11 +136,15 @@ def roll(input: Tensor, shifts: Any, dims: Any = None) -> Tensor:
     return _rearranged("Roll", input, places.flat(), input.shape)
 
 
-def cat(tensors: Sequence[Tensor], dim: int = 0) -> Tensor:
-    tensors = list(tensors)
-    for number, other in enumerate(tensors):
+def _all_tensors(entries: Sequence[Any]) -> list[Tensor]:
+    for number, other in enumerate(entries):
         if not isinstance(other, Tensor):
             raise TypeError(f"expected Tensor as element {number} in argument 0, but got {type(other).__name__}")
+    return list(entries)
+
+
+def cat(tensors: Sequence[Tensor], dim: int = 0) -> Tensor:
+    tensors = _all_tensors(tensors)
     if not tensors:
         raise ValueError("torch.cat(): expected a non-empty list of Tensors")
     if any(not t.shape for t in tensors):
@@ -190,10 +194,7 @@ concat = concatenate = cat
 
 
 def stack(tensors: Sequence[Tensor], dim: int = 0) -> Tensor:
-    tensors = list(tensors)
-    for number, other in enumerate(tensors):
-        if not isinstance(other, Tensor):
-            raise TypeError(f"expected Tensor as element {number} in argument 0, but got {type(other).__name__}")
+    tensors = _all_tensors(tensors)
     if not tensors:
         raise RuntimeError("stack expects a non-empty TensorList")
     axis_of(dim, tensors[0].ndim + 1)

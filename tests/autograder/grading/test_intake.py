@@ -84,7 +84,7 @@ def test_a_linked_folder_is_refused(tmp_path, folder):
     link.parent.mkdir()
     link.symlink_to(folder)
     assert "is a link" in intake.read("mallory", "ch44", link).problem
-    assert ("mallory", "ch44", link) in intake.discover(tmp_path)
+    assert ("mallory", "ch44", link) in intake.survey(tmp_path, ()).tasks
 
 
 def test_a_huge_notebook_is_refused_unread(folder):
@@ -159,7 +159,7 @@ def test_too_many_cells_are_refused(folder):
 @pytest.mark.parametrize("name", ["two\nlines", "tab\t", b"latin-\xe9".decode(errors="surrogateescape"), "x" * 255])
 def test_a_name_that_no_file_of_ours_can_have_is_replaced(tmp_path, name):
     (tmp_path / name / name).mkdir(parents=True)
-    [(student, assignment, folder)] = intake.discover(tmp_path)
+    [(student, assignment, folder)] = intake.survey(tmp_path, ()).tasks
     assert plain_name(student) == student == assignment and folder == tmp_path / name / name
 
 
@@ -167,4 +167,4 @@ def test_discovery_ignores_dots_and_files(tmp_path, folder):
     (tmp_path / ".git" / "ch44").mkdir(parents=True)
     (tmp_path / "alice" / ".ipynb_checkpoints").mkdir()
     (tmp_path / "notes.txt").write_text("")
-    assert intake.discover(tmp_path) == [("alice", "ch44", folder)]
+    assert intake.survey(tmp_path, ()).tasks == [("alice", "ch44", folder)]

@@ -37,7 +37,7 @@ assignments:
 
 def papers(into):
     """(student, assignment) → the notebook's bytes, as the grader would find them."""
-    found = intake.discover(into)
+    found = intake.survey(into, ()).tasks
     return {(s, a): (f / f"{a}.ipynb").read_bytes() if (f / f"{a}.ipynb").exists() else None for s, a, f in found}
 
 
