@@ -4,7 +4,8 @@ A program, run by autograder.proving.practice with no package but the page's own
 input, another on standard output.
 
 The answers are functions of modules that import more than the page has. Of what is missing, modules may name all and call all while they
-are imported; when the answers are judged, every use says that it is missing.
+are imported; when the answers are judged, every use says that it is missing. Texts of cells are judged with no more of course_lib
+than the page has.
 """
 
 from __future__ import annotations
@@ -38,6 +39,22 @@ def _lenient(torch: Any, names: Any, elsewhere: Any) -> Iterator[None]:
             owner.__getattr__ = own
 
 
+def _only(library: list[str]) -> None:
+    """Forget what of course_lib the page does not have: from now on, importing it gives what it gives there."""
+    own = {f"course_lib/{file}".removesuffix(".py").removesuffix("/__init__").replace("/", ".") for file in library}
+    for name in own:
+        importlib.import_module(name)
+    for name, module in list(sys.modules.items()):
+        if name == "course_lib" or name in own:
+            if hasattr(module, "__path__"):
+                module.__path__ = []
+        elif name.startswith("course_lib."):
+            del sys.modules[name]
+            owner, _, last = name.rpartition(".")
+            if owner in sys.modules:
+                vars(sys.modules[owner]).pop(last, None)
+
+
 def main() -> None:
     """Answer: for each exercise, for each answer, its state, misconceptions and message, and the seconds that it took."""
     task = json.load(sys.stdin)
@@ -68,10 +85,12 @@ def main() -> None:
             start = time.perf_counter()
             result = judge.judged(frozen, function)
             rows.append([kind, name, result["state"], result["misconceptions"], result["message"], time.perf_counter() - start])
-        start = time.perf_counter()
-        result = judge.check(exercise.name, task["references"][exercise.name])
-        rows.append(["text", "", result["state"], result["misconceptions"], result["message"], time.perf_counter() - start])
         told[exercise.name] = rows
+    _only(task["library"])
+    for name, rows in told.items():
+        start = time.perf_counter()
+        result = judge.check(name, task["references"][name])
+        rows.append(["text", "", result["state"], result["misconceptions"], result["message"], time.perf_counter() - start])
     json.dump(told, sys.stdout)
 
 

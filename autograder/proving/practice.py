@@ -36,6 +36,8 @@ LIBRARY = (
     "checks/observing.py",
     "checks/results.py",
     "checks/telling.py",
+    "control/__init__.py",
+    "control/replay.py",
 )
 RESTS_ON = ("autograder.authoring.freeze:visible", "course_lib.checks.results:examined")  # beside this module and the page's own
 ELSEWHERE = ("is not in the page; it is in the notebook", "is not in the page's torch; it is in the notebook")
@@ -193,7 +195,7 @@ def _on_the_page(chapter: Chapter, exercises: list[Exercise]) -> dict[str, list]
         return {}
     text = page_of(chapter, [one.name for one in exercises])
     cases = json.loads(text)["page"]["cases"]
-    task = {"assignment": chapter.assignment, "page": text, "cases": cases, "references": answers(chapter)}
+    task = {"assignment": chapter.assignment, "page": text, "cases": cases, "references": answers(chapter), "library": LIBRARY}
     command = [sys.executable, "-S", "-E", "-B", str(PROCESS)]
     done = subprocess.run(command, input=json.dumps(task), capture_output=True, text=True, timeout=PATIENCE, check=False)
     if done.returncode:

@@ -13,6 +13,7 @@ import dataclasses
 import io
 import json
 import linecache
+import re
 import sys
 import traceback
 import types
@@ -26,6 +27,8 @@ from torch import missing  # type: ignore[attr-defined]  # of the page's torch
 
 HERE = Path(__file__).parent
 MAX_PRINTED = 10_000
+PROMPT = re.compile(r"^\s*(>>>|\.\.\.)( |$)")
+HELP = re.compile(r"^\s*\?{0,2}[\w.]+\?{1,2}\s*$|^\s*\?{1,2}[\w.]+\s*$")
 
 
 def _library(folder: Path) -> None:
@@ -185,10 +188,12 @@ def run_cell(source: str, namespace: dict[str, Any]) -> tuple[str, str]:
         code = compile(source, "<cell>", "exec", dont_inherit=True)
     except (SyntaxError, ValueError) as error:
         lines = source.splitlines()
-        plain = ["" if line.lstrip()[:1] in ("%", "!") else line for line in lines]
-        if plain == lines:
+        if any(line.lstrip().startswith(">>>") for line in lines):  # pasted from a prompt, which IPython takes away, too
+            lines = [PROMPT.sub("", line) for line in lines]
+        plain = ["" if line.lstrip()[:1] in ("%", "!") or HELP.match(line) else line for line in lines]
+        if plain == source.splitlines():
             return told, _syntax(error)
-        told = "Lines that begin with % or ! are left out on the page.\n"
+        told = "" if plain == lines else "Lines that begin with % or !, or ask for help with ?, are left out on the page.\n"
         try:
             source = "\n".join(plain)
             code = compile(source, "<cell>", "exec", dont_inherit=True)

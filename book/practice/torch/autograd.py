@@ -10,7 +10,7 @@ import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from .missing import missing
+from .missing import Missing, missing
 
 _recording = [True]
 
@@ -137,10 +137,13 @@ def grad(
     inputs: Any,
     grad_outputs: Any = None,
     retain_graph: bool | None = None,
+    create_graph: bool = False,
     *,
     allow_unused: bool = False,
 ) -> tuple[Any, ...]:
     """The gradients of `outputs` with regard to `inputs`, as `torch.autograd.grad` gives them."""
+    if create_graph:
+        raise Missing("torch.autograd.grad with create_graph=")
     outputs = list(outputs) if isinstance(outputs, (tuple, list)) else [outputs]
     inputs = list(inputs) if isinstance(inputs, (tuple, list)) else [inputs]
     weights = list(grad_outputs) if isinstance(grad_outputs, (tuple, list)) else [grad_outputs] * len(outputs)

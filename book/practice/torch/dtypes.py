@@ -97,6 +97,11 @@ bfloat16 = dtype("bfloat16", "BFloat16", 2, 3.4)
 BY_NAME = {kind.name: kind for kind in (bool_, uint8, int8, int16, int32, int64, float16, bfloat16, float32, float64)}
 
 
+def named(kind: Any) -> Any:
+    """Python's float, int and bool as kinds; anything else as it is."""
+    return {float: float64, int: int64, bool: bool_}.get(kind, kind) if isinstance(kind, type) else kind
+
+
 def of_number(value: Any) -> dtype:
     """The kind of a Python number; a float is taken for the default, float32."""
     return bool_ if isinstance(value, bool) else int64 if isinstance(value, int) else float32

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import operator
 from collections.abc import Callable, Sequence
@@ -114,6 +115,11 @@ def logistic(x: float) -> float:
     return e / (1 + e)
 
 
+def _sigmoid(largest: float, x: float) -> float:
+    """As torch computes it, which is 0 where exp(-x) is more than the kind holds: `largest` is that number's logarithm."""
+    return 0.0 if -x > largest else logistic(x)
+
+
 def log_logistic(x: float) -> float:
     """log sigmoid x, exact on both sides."""
     return min(x, 0.0) - math.log1p(math.exp(-abs(x))) if x == x else nan
@@ -220,7 +226,10 @@ def _of_one(name: str) -> Callable:
         keeps = "result" if name in _KEEPS_RESULT else "nothing" if name in _KEEPS_NOTHING else "operands"
         if name in _FLOATS:
             compute, slope = _FLOATS[name]
-            return entrywise(name, compute, [slope], [input], float_kind(input), keeps)
+            kind = float_kind(input)
+            if name == "sigmoid":
+                compute = functools.partial(_sigmoid, 709.782712893384 if kind is dtypes.float64 else 88.72283905)
+            return entrywise(name, compute, [slope], [input], kind, keeps)
         if name in _KEEPING_THEIR_KIND:
             if input.dtype is dtypes.bool_ and name in _NOT_OF_TRUTH_VALUES:
                 raise RuntimeError(_NOT_OF_TRUTH_VALUES[name])

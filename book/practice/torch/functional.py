@@ -7,12 +7,11 @@ from array import array
 from collections.abc import Sequence
 from typing import Any
 
-from . import dtypes
+from . import dtypes, rows
 from .entrywise import OF_ONE, entrywise, exponential, floats_only, log_logistic, logistic, sign_of, where
 from .making import full, make, nan
 from .missing import Missing, missing
 from .moving import cat
-from .rows import log_softmax
 from .shapes import broadcast_shapes
 from .tensor import Tensor
 
@@ -21,6 +20,19 @@ sigmoid, tanh, relu = OF_ONE["sigmoid"], OF_ONE["tanh"], OF_ONE["relu"]
 
 def __getattr__(name: str) -> Any:
     raise missing("torch.nn.functional", name)
+
+
+def _axis_taken(input: Tensor, dim: int | None) -> int:
+    """Where no axis is named, torch warns and takes one."""
+    return dim if dim is not None else 0 if input.ndim in (0, 1, 3) else 1
+
+
+def softmax(input: Tensor, dim: int | None = None, *, dtype: Any = None) -> Tensor:
+    return rows.softmax(input, _axis_taken(input, dim), dtype=dtype)
+
+
+def log_softmax(input: Tensor, dim: int | None = None, *, dtype: Any = None) -> Tensor:
+    return rows.log_softmax(input, _axis_taken(input, dim), dtype=dtype)
 
 
 def logsigmoid(input: Tensor) -> Tensor:

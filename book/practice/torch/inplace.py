@@ -39,5 +39,5 @@ def in_place(function: Callable, name: str) -> Callable:
 def _as_it_was(x: Tensor) -> Tensor:
     """A copy of the tensor before the change, with its graph: steps may rely on it."""
     kept = Tensor(Storage(x.flat()), x.shape, x.dtype)
-    kept.requires_grad, kept.step = x.requires_grad, x.step
+    kept._requires_grad, kept.step = x.requires_grad, x.step
     return kept

@@ -24,7 +24,7 @@ def make(numbers: Sequence[Any], shape: Sequence[int], kind: dtypes.dtype) -> Te
 def record(result: Tensor, name: str, sources: Sequence[Tensor], send_back: Callable, relies_on: Sequence[Tensor] = ()) -> Tensor:
     """Let the result remember how it was made, if a gradient may be asked for."""
     if is_recording() and result.dtype.is_floating_point and any(source.requires_grad for source in sources):
-        result.requires_grad, result.step = True, Node(name, sources, send_back, relies_on)
+        result._requires_grad, result.step = True, Node(name, sources, send_back, relies_on)
         result.step.result = result
     return result
 
@@ -45,7 +45,7 @@ def tensor(data: Any, *, dtype: Any = None, device: Any = None, requires_grad: b
     return from_nested(data, dtype).requires_grad_(requires_grad) if requires_grad else from_nested(data, dtype)
 
 
-def as_tensor(data: Any, dtype: Any = None, device: Any = None) -> Tensor:
+def as_tensor(data: Any, *, dtype: Any = None, device: Any = None) -> Tensor:
     return data.to(dtype or data.dtype) if isinstance(data, Tensor) else from_nested(data, dtype)
 
 
@@ -109,7 +109,7 @@ def linspace(start: float, end: float, steps: int, *, dtype: Any = None, device:
 
 
 def to(input: Tensor, *args: Any, dtype: Any = None, device: Any = None, copy: bool = False, **_rest: Any) -> Tensor:
-    for argument in args:
+    for argument in map(dtypes.named, args):
         if isinstance(argument, dtypes.dtype):
             dtype = argument
         elif isinstance(argument, Tensor):

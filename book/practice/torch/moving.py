@@ -240,6 +240,8 @@ def repeat(input: Tensor, *sizes: Any) -> Tensor:
 
 
 def repeat_interleave(input: Tensor, repeats: int, dim: int | None = None) -> Tensor:
+    if not isinstance(repeats, int):
+        raise Missing("torch.repeat_interleave by a tensor")
     x, dim = (input.reshape(-1), 0) if dim is None else (input, dim)
     if not x.ndim:
         raise IndexError("Dimension out of range (expected to be in range of [-1, 0], but got 1)")  # so torch says

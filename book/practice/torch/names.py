@@ -72,6 +72,8 @@ def _public(owner: str, name: str, function: Callable) -> Callable:
 
     @functools.wraps(function)
     def public(*args: Any, **kwargs: Any) -> Any:
+        if "dtype" in kwargs:
+            kwargs["dtype"] = dtypes.named(kwargs["dtype"])
         for word in list(kwargs):
             if word in parameters or takes_any:
                 continue
@@ -112,7 +114,7 @@ class Namespace(ModuleType):
 
 def _functional() -> dict[str, Any]:
     own = {name: value for name, value in vars(functional).items() if getattr(value, "__module__", "") == functional.__name__}
-    borrowed = {name: _BOTH[name] for name in ("sigmoid", "tanh", "relu", "log_softmax", "softmax")}
+    borrowed = {name: _BOTH[name] for name in ("sigmoid", "tanh", "relu")}
     return {name: _public("torch.nn.functional", name, value) for name, value in (own | borrowed).items() if name[0] != "_"}
 
 
@@ -170,6 +172,18 @@ _CONVERSIONS = (
 )
 
 
+def _type(self: Tensor, dtype: Any = None, non_blocking: bool = False) -> Tensor:
+    if dtype is None or isinstance(dtype, str):
+        raise Missing("Tensor.type of names")
+    if isinstance(dtype, type):
+        raise ValueError(f"invalid type: '{dtype.__name__}'")
+    return self.to(dtype)
+
+
+def _no_shift(self: Tensor, other: Any) -> Tensor:
+    raise Missing("Tensor.bitwise_left_shift and its like")
+
+
 def _matrices_turned(x: Tensor) -> Tensor:
     if x.ndim == 1:
         raise RuntimeError("tensor.mT is only supported on matrices or batches of matrices. Got 1-D tensor.")
@@ -187,7 +201,7 @@ def _equip() -> None:
         "fill_": lambda self, value: self.write(value),
         "zero_": lambda self: self.write(0),
         "where": lambda self, condition, other: entrywise.where(condition, self, other),
-        "type": lambda self, kind: self.to(kind),
+        "type": _type,
         "cpu": lambda self: self,
         "view_as": lambda self, other: self.view(other.shape),
         "expand_as": lambda self, other: self.expand(other.shape),
@@ -228,6 +242,10 @@ def _equip_operators() -> None:
     for name in ("neg", "abs"):
         setattr(Tensor, f"__{name}__", _BOTH[name])
     setattr(Tensor, "__invert__", entrywise.bitwise_not)  # noqa: B010
+    for name in ("lshift", "rshift"):
+        setattr(Tensor, f"__{name}__", _no_shift)
+        setattr(Tensor, f"__r{name}__", _no_shift)
+    setattr(Tensor, "__reversed__", lambda self: self.flip(0) if self.shape else self)  # noqa: B010
     setattr(Tensor, "__pos__", lambda self: self)  # noqa: B010
 
 

@@ -12,6 +12,11 @@ from .missing import Missing, missing
 from .printing import shown
 from .shapes import Size, axis_of, broadcast_shapes, count, positions, strides_of
 
+ONLY_LEAVES = "you can only change requires_grad flags of leaf variables."
+DETACH = (
+    " If you want to use a computed variable in a subgraph that doesn't require differentiation use var_no_grad = var.detach()."
+)
+
 
 class Storage:
     """The row of numbers that a tensor and its views share; `version` counts the changes in place."""
@@ -40,8 +45,15 @@ class Tensor:
     )
 
     def __init__(
-        self, storage: Storage, shape: Sequence[int], kind: dtypes.dtype, strides: Sequence[int] | None = None, offset: int = 0
+        self,
+        storage: Storage,
+        shape: Sequence[int] = (),
+        kind: dtypes.dtype = dtypes.float32,
+        strides: Sequence[int] | None = None,
+        offset: int = 0,
     ):
+        if not isinstance(storage, Storage):  # a learner's torch.Tensor([1.0])
+            raise Missing("torch.Tensor as a function")
         self.storage, self.offset, self.dtype = storage, offset, kind
         self.shape = Size(shape)
         self.strides = tuple(strides_of(shape) if strides is None else strides)
@@ -210,20 +222,29 @@ class Tensor:
 
     @requires_grad.setter
     def requires_grad(self, value: bool) -> None:
+        if self.grad_fn is not None:
+            raise RuntimeError(ONLY_LEAVES + ("" if value else DETACH))
+        if value and not self.dtype.is_floating_point:
+            raise RuntimeError("only Tensors of floating point and complex dtype can require gradients")
         self._requires_grad = value
 
     def requires_grad_(self, requires_grad: bool = True) -> Tensor:
         if requires_grad and not self.dtype.is_floating_point:
             raise RuntimeError("only Tensors of floating point dtype can require gradients")
-        self.requires_grad = requires_grad
+        if not requires_grad or self.grad_fn is None:
+            self.requires_grad = requires_grad
         return self
 
     def detach(self) -> Tensor:
         """The same numbers, without a graph."""
         return Tensor(self.storage, self.shape, self.dtype, self.strides, self.offset)
 
-    def backward(self, gradient: Tensor | None = None, retain_graph: bool | None = None) -> None:
+    def backward(
+        self, gradient: Tensor | None = None, retain_graph: bool | None = None, create_graph: bool = False, inputs: Any = None
+    ) -> None:
         """Add to the `grad` of every leaf behind this tensor."""
+        if create_graph or inputs is not None:
+            raise Missing(f"Tensor.backward with {'create_graph' if create_graph else 'inputs'}=")
         accumulate(self, gradient, retain_graph)
 
     def follow_base(self) -> None:
@@ -245,7 +266,7 @@ class Tensor:
                     numbers[place] += value
                 return (Tensor(Storage(numbers), base.shape, base.dtype),)
 
-            self.requires_grad, self.step = True, Node("ViewBackward0", (base,), send_back)
+            self._requires_grad, self.step = True, Node("ViewBackward0", (base,), send_back)
             self._base_step = base.step
 
     def _places_in(self, base: Tensor) -> Sequence[int]:
@@ -380,7 +401,7 @@ class Tensor:
                     numbers[order[place]] += value
                 return (Tensor(Storage(numbers), self.shape, self.dtype),)
 
-            result.requires_grad, result.step = True, Node("IndexBackward0", (self,), send_back)
+            result._requires_grad, result.step = True, Node("IndexBackward0", (self,), send_back)
         return result
 
     def write(self, value: Any) -> Tensor:
@@ -431,9 +452,9 @@ class Tensor:
             return Tensor(Storage(kept), gradient.shape, gradient.dtype), _as_kind(sum_to(to_value, value.shape), value.dtype)
 
         owner.step = Node("torch::autograd::CopySlices", (owner, value), send_back)
-        owner.requires_grad = True
+        owner._requires_grad = True
         if owner is not self:
-            self.requires_grad = True
+            self._requires_grad = True
             self.follow_base()
 
 
@@ -585,7 +606,9 @@ def from_nested(value: Any, kind: dtypes.dtype | None = None) -> Tensor:
         raise Missing("torch.complex64")
     for number in numbers:
         if not isinstance(number, (int, float)):
-            raise TypeError(f"new(): invalid data type '{type(number).__name__}'")
+            if isinstance(number, str):
+                raise TypeError("new(): invalid data type 'str'")
+            raise RuntimeError(f"Could not infer dtype of {type(number).__name__}")
     kind = kind or max(kinds, key=lambda one: one.rank, default=dtypes.float32)
     return Tensor(Storage(kind.numbers(numbers)), shape, kind)
 

@@ -61,6 +61,15 @@ def test_the_gate_gives_what_is_recorded():
     assert len(seconds) == found.answers
 
 
+def test_an_answer_that_needs_more_of_the_library_than_a_page_has_is_not_offered(monkeypatch):
+    (with_replay,), _ = practice.rows("ch48", ["repaired_transitions"])
+    assert with_replay.offered and with_replay.answers
+    monkeypatch.setattr(practice, "LIBRARY", tuple(name for name in practice.LIBRARY if not name.startswith("control/")))
+    (without,), _ = practice.rows("ch48", ["repaired_transitions"])
+    lacking = "course_lib.control.replay.Transitions is not in the page; it is in the notebook"
+    assert without.elsewhere["the book's answer, as text"] == lacking and not without.offered
+
+
 def test_the_book_prints_what_is_recorded(keys, capsys):
     own = chapter.load("ch43")
     page = practice_page({"Chapter": practice_rows(own, keys)})

@@ -139,7 +139,46 @@ def test_kinds_are_promoted_alike(operator):
             assert run([f"r = x {operator} {number}"], graph=False, x=((1,), (), a)) == "", (a, number)
 
 
+@pytest.mark.parametrize(
+    "expression",
+    [
+        "T.zeros(2, dtype=bool)", "T.tensor([1, 2], dtype=float)", "x.to(int)", "x.to(dtype=float)", "x.sum(dtype=float)",
+        "T.zeros_like(x, dtype=bool)", "x.new_zeros(2, dtype=int)", "x.long().type(bool)", "T.as_tensor([1], dtype=float)",
+    ],
+)  # fmt: skip
+def test_pythons_own_types_are_kinds(expression):
+    assert run([f"r = {expression}"], graph=False, x=((1.5, 0.0), (2,), "float32")) == ""
+
+
+@pytest.mark.parametrize("shape", [(), (6,), (2, 3), (1, 2, 3), (1, 2, 1, 3)])
+def test_a_softmax_that_names_no_axis_takes_torchs(shape):
+    entries = tuple(float(i * i) for i in range(6))[: math.prod(shape)]
+    for name in ("softmax", "log_softmax"):
+        assert run([f"r = F.{name}(x)"], x=(entries, shape, "float64")) == ""
+        assert run([f"r = T.{name}(x)"], x=(entries, shape, "float64")) == ""  # an error
+
+
+@pytest.mark.parametrize("kind", ["float16", "float32", "float64"])
+def test_a_sigmoid_vanishes_where_torchs_does(kind):
+    entries = (-709.7, -709.8, -740.0, -88.72, -88.723, -100.0, -87.0, 5.0, 1000.0)
+    for entry in entries:
+        assert run(["r = x.sigmoid() == 0"], graph=False, x=((entry,), (1,), kind)) == "", entry
+        assert run(["r = T.sigmoid(x).log()"], graph=False, x=((entry,), (1,), kind)) == "", entry
+
+
+def test_who_wants_a_gradient_is_said_of_leaves_alone():
+    x = ((1.0, 2.0), (2,), "float64")
+    for value in (True, False):
+        assert run([f"r = x.exp(); r.requires_grad = {value}"], x=x) == ""
+        assert run([f"r = x.exp(); r.requires_grad_({value})"], x=x) == ""
+        assert run([f"r = x.detach(); r.requires_grad = {value}"], x=x) == ""
+        assert run([f"r = x.long(); r.requires_grad = {value}"], x=x) == ""
+        assert run([f"r = x.long().requires_grad_({value})"], x=x) == ""
+
+
 LEARNERS = {
+    "nothing is made a number": ["r = T.tensor([None, 1.0])"],
+    "a computed tensor is taken out of the graph": ["x.requires_grad = False", "r = x"],
     "a mask is subtracted from 1": ["r = 1 - m"],
     "a mask is negated": ["r = -m"],
     "a float is inverted": ["r = ~x"],
@@ -212,6 +251,14 @@ def test_what_learners_write_fails_in_the_same_words(mistake):
         ("T.tensor(1j)", "torch.complex64"),
         ("x * 1j", "torch.complex64"),
         ("x.to('cuda')", "torch.device('cuda')"),
+        ("T.Tensor([1.0])", "torch.Tensor as a function"),
+        ("x.type()", "Tensor.type of names"),
+        ("x.long() << 1", "Tensor.bitwise_left_shift and its like"),
+        ("1 >> x.long()", "Tensor.bitwise_left_shift and its like"),
+        ("x.repeat_interleave(x.long())", "torch.repeat_interleave by a tensor"),
+        ("T.autograd.grad(x, x, create_graph=True)", "torch.autograd.grad with create_graph="),
+        ("x.backward(create_graph=True)", "Tensor.backward with create_graph="),
+        ("x.backward(inputs=[x])", "Tensor.backward with inputs="),
     ],
 )
 def test_what_is_lacking_is_named(expression, what):
