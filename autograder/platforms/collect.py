@@ -221,6 +221,7 @@ class _Sorting:
     def _labels(self, handed: Sequence[Handed]) -> dict[str, str]:
         """Each person's folder: what --names says; else what the platform shows, with the id where two are called the same."""
         labels: dict[str, str] = {}
+        same: dict[tuple[str, str], str] = {}
         owners = {student: (platform, number) for student, (platform, number) in self.before.items() if platform in PEOPLES_IDS}
         for one in handed:
             if one.person in labels:
@@ -237,6 +238,13 @@ class _Sorting:
                 if platform == one.platform and number != one.platform_id:
                     default = label(f"{shown}-{one.platform_id}".strip())
             labels[one.person] = mapped or default
+            if mapped and one.platform_id and one.platform in PEOPLES_IDS:
+                first = same.setdefault((one.platform, mapped), one.platform_id)
+                if first != one.platform_id:
+                    self.done.notes.append(
+                        f"{one.download}: --names has {mapped} for {first} and for {one.platform_id}, whose work is taken for attempts of"
+                        " one person; if they are two, give each a student"
+                    )
             if self.people and not mapped and not one.unknown:
                 told = ", ".join(filter(None, (one.platform_id, one.login, one.email, one.name)))
                 self.done.problems.append(f"{one.download}: --names does not have {told}; collected as {default}")

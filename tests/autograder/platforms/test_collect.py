@@ -302,6 +302,13 @@ def test_side_files_keep_their_names_or_get_the_ones_that_the_chapter_asks_for(t
 # --- who is who --------------------------------------------------------------------------------------------------------------
 
 
+def test_two_people_whom_names_calls_one_are_told(tmp_path, into):
+    (tmp_path / "names.csv").write_text("id;student\n12345;jane\n12346;jane\n12347;li\n")
+    done = collect.collect([zipped(tmp_path / "a.zip", CANVAS)], into, names=tmp_path / "names.csv")
+    (note,) = [note for note in done.notes if "--names" in note]
+    assert "--names has jane for 12345 and for 12346" in note and "give each a student" in note
+
+
 def test_names(tmp_path, into):
     (tmp_path / "names.csv").write_text("id;student\n12345;jane\n12346;john\n")
     done = collect.collect([zipped(tmp_path / "a.zip", CANVAS)], into, names=tmp_path / "names.csv")
