@@ -375,7 +375,12 @@ def diag(input: Tensor, diagonal: int = 0) -> Tensor:
     return input.diagonal().clone() if input.ndim == 2 else diag_embed(input)
 
 
-def diag_embed(input: Tensor) -> Tensor:
-    size = input.shape[-1]
-    main = make([i == j for i in range(size) for j in range(size)], (size, size), dtypes.bool_)
-    return where(main, input.unsqueeze(-1), _nothing(input))
+def diag_embed(input: Tensor, offset: int = 0, dim1: int = -2, dim2: int = -1) -> Tensor:
+    if (dim1, dim2) != (-2, -1):
+        raise Missing("torch.diag_embed with dim1= or dim2=")
+    size = input.shape[-1] + abs(offset)
+    around = [
+        make([0] * many, (many,), input.dtype).expand(*input.shape[:-1], many) for many in (max(-offset, 0), max(offset, 0))
+    ]
+    chosen = make([j - i == offset for i in range(size) for j in range(size)], (size, size), dtypes.bool_)
+    return where(chosen, cat([around[0], input, around[1]], -1).unsqueeze(-1), _nothing(input))

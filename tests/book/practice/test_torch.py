@@ -36,6 +36,13 @@ def test_binary_cross_entropy_is_torchs_at_the_ends_too():
     assert run(["r = F.binary_cross_entropy(x, y)"], x=(x, (4,), "float64"), y=(y, (4,), "float64")) == ""
 
 
+@pytest.mark.parametrize("offset", [-2, -1, 0, 1, 3])
+@pytest.mark.parametrize("shape", [(3,), (2, 2), (1, 0)])
+def test_numbers_laid_on_a_diagonal_lie_where_torch_lays_them(offset, shape):
+    entries = [float(number) + 1 for number in range(math.prod(shape))]
+    assert run([f"r = torch.diag_embed(x, {offset})"], x=(entries, shape, "float64")) == ""
+
+
 def run(statements, graph=True, **tensors):
     """How the two torches differ on a program."""
     made = {name: Tensor(tuple(entries), shape, kind) for name, (entries, shape, kind) in tensors.items()}
