@@ -93,20 +93,20 @@ def page(chapters: Sequence[Chapter], pages: Mapping[str, bytes]) -> str:
 def _shown(found: Entry, place: str) -> Iterator[str]:
     yield f"### [`{found.name}`]({place})"
     yield f":::{{div}} sheet-signature\n`({found.arguments}) → {found.returns}`\n:::"
-    yield _escaped(found.says)
+    yield _typeset(found.says)
     if found.formula:
         yield f":::{{div}} sheet-formula\n{_typeset(found.formula)}\n:::"
     if found.lacks:
         yield f"*Its docstring lacks {_escaped(found.lacks)}.*"
 
 
-def _typeset(formula: str) -> str:
-    """A formula in MyST, indices lowered."""
+def _typeset(text: str) -> str:
+    """Text or a formula in MyST, indices lowered."""
     parts, end = [], 0
-    for match in INDEX.finditer(formula):
-        parts += [_escaped(formula[end : match.start()]), f"{{sub}}`{match[1] or match[2] or match[3]}`"]
+    for match in INDEX.finditer(text):
+        parts += [_escaped(text[end : match.start()]), f"{{sub}}`{match[1] or match[2] or match[3]}`"]
         end = match.end()
-    return "".join([*parts, _escaped(formula[end:])]).replace(",   ", ",\N{EM SPACE}")
+    return "".join([*parts, _escaped(text[end:])]).replace(",   ", ",\N{EM SPACE}")
 
 
 def _escaped(text: str) -> str:
