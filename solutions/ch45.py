@@ -130,6 +130,9 @@ def collect_rollout(envs, policy, num_steps, obs, generator):
 def minibatches(batch_size, minibatch_size, generator):
     """The minibatches of one epoch: every index once, in a fresh random order.
 
+        order[k m : (k + 1) m],   k = 0, 1, …,   m = minibatch_size,
+        order = a random permutation of 0, …, batch_size - 1
+
     Args:
       batch_size: number of samples, at least 1.
       minibatch_size: samples in a minibatch, at least 1; the last one may be shorter.

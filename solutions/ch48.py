@@ -143,6 +143,9 @@ def interquartile_mean(scores):
     """The mean of the middle half of all scores: no lucky run lifts it, no failed one ruins
     it.
 
+        Σ_i w_i s_{(i)} / (n / 2),   w_i = length of [i - 1, i] ∩ [n / 4, 3 n / 4],
+        s_{(i)} = the i-th smallest of n scores
+
     A quarter of the weight is cut off at each end. Where the count n is no multiple of 4,
     the scores at the two edges count in part: the weights, n / 2 in all, are those of n
     scores laid side by side, one unit each, from n / 4 to 3 n / 4.
@@ -164,6 +167,8 @@ def interquartile_mean(scores):
 
 def bootstrap_interval(scores, confidence=0.95, num_resamples=2000, generator=None):
     """How far the interquartile mean could be off: a stratified percentile bootstrap.
+
+        quantiles α / 2 and 1 - α / 2 of IQM(scores of redrawn seeds),   α = 1 - confidence
 
     As many seeds as there are are drawn, with replacement, for each task apart; the
     interquartile mean of all that was drawn is noted, and this is repeated. The interval

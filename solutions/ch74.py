@@ -56,6 +56,8 @@ def collect_demonstrations(policy, env, num_episodes, seed):
 def split_by_episode(episode_ids, fraction, generator):
     """Divide the steps of a data set into training and held-out ones, by whole episodes.
 
+        held out of E episodes: min(max(round(fraction · E), 1), E - 1), drawn at random
+
     Args:
       episode_ids: which episode each step belongs to; (M,) int64, any numbers, in any
         order.
@@ -195,7 +197,8 @@ def evaluate(policy, env, num_episodes, seed):
 def state_shift(expert_obs, agent_obs):
     """How far the states that an agent visits lie from those that the expert visited.
 
-        2 E|X - Y| - E|X - X'| - E|Y - Y'|,   X = expert_obs / σ,   Y = agent_obs / σ
+        2 E|X - Y| - E|X - X'| - E|Y - Y'|,   X = expert_obs / σ,   Y = agent_obs / σ,
+        σ = std(expert_obs)
 
     The squared energy distance, with means over all ordered pairs (i = j included) and σ
     the expert's standard deviation in each dimension. Székely and Rizzo (2013),

@@ -30,6 +30,8 @@ def per_token_logps(logits, input_ids):
 def completion_mask(input_ids, prompt_lengths, eos_token_id):
     """Which tokens the policy chose: from the end of the prompt to the first end token.
 
+        mask_t = [prompt_length ≤ t ≤ end],   end = min{t ≥ prompt_length : input_ids_t = eos}
+
     The end token itself is a choice and is kept. An end token within the prompt, or
     used as padding before it, ends nothing.
 

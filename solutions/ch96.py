@@ -16,6 +16,8 @@ def last_token_scores(values, attention_mask):
     """The reward model's verdict on each text: its number at the last token that is no
     padding.
 
+        score = values_l,   l = max{t : attention_mask_t}
+
     Only there has a causal model read the whole text.
 
     Args:
@@ -58,6 +60,8 @@ def reward_model_loss(chosen_scores, rejected_scores, margin=None):
 
 def best_of_n(scores):
     """Of n candidates for each prompt, the one with the highest score.
+
+        argmax_i scores_i,   i = 0, …, n - 1
 
     Args:
       scores: of n completions of each of B prompts; (B, n).

@@ -47,7 +47,7 @@ _INLINE = re.compile(
     r"\{(?P<role>[A-Za-z][\w:+-]*)\}`(?P<content>[^`]+)`"
     r"|(?P<ticks>`+)(?!`).+?(?<!`)(?P=ticks)(?!`)"
     r"|(?<![\\$])\$(?!\$)(?:\\.|[^$\\\n]|\n(?!\s*\n))+?\$"
-    r"|\[(?P<text>[^\]]*)\]\(chapter:(?P<chapter>\d+)\)",
+    r"|\[(?P<text>[^\]]*)\]\((?:chapter:(?P<chapter>\d+)|appendix:(?P<appendix>[a-z-]+))\)",
     re.DOTALL,
 )
 _REFUSED = [
@@ -56,6 +56,7 @@ _REFUSED = [
     (re.compile(r"(?<!\\)\$"), "this $ has no partner: maths is $x$ in one paragraph or $$ … $$ on lines of its own, money \\$5"),
     (re.compile(r"\[\^"), "footnotes are not used: notebooks cannot show them; write a :::{margin} note"),
     (re.compile(r"\(chapter:"), "a link to a chapter is written [text](chapter:43)"),
+    (re.compile(r"\(appendix:"), "a link to an appendix is written [text](appendix:notation)"),
     (re.compile(r"(BEGIN|END) (SOLUTION|HIDDEN TESTS|MARK SCHEME)"), "nbgrader would take this text for a marker of its own"),
 ]
 
@@ -148,6 +149,10 @@ class Dialect(ABC):
     def chapter(self, number: int, text: str) -> str:
         """A link to another chapter, or its text alone if that chapter is not written."""
 
+    def appendix(self, name: str, text: str) -> str:
+        """A link to an appendix of the book; its text alone where there is none, as in a notebook."""
+        return text
+
     @abstractmethod
     def bibliography(self) -> str:
         """The works in `cited`."""
@@ -197,6 +202,9 @@ class Book(Dialect):
 
     def chapter(self, number: int, text: str) -> str:
         return f"[{text}]({self.pages[number]}.ipynb)" if number in self.pages else text
+
+    def appendix(self, name: str, text: str) -> str:
+        return f"[{text}](../{name}.md)"
 
     def bibliography(self) -> str:
         return f"```{{bibliography}}\n:filter: docname in docnames\n:keyprefix: {self.assignment}-\n```"
@@ -265,7 +273,9 @@ def _rendered(block: Block, dialect: Dialect) -> str:
         return dialect.math(block)
     if block.kind == "quiz":
         return _quiz(block, dialect)
-    if block.kind == "dropdown" and any(match["role"] or match["chapter"] for match in _INLINE.finditer(block.argument)):
+    if block.kind == "dropdown" and any(
+        match["role"] or match["chapter"] or match["appendix"] for match in _INLINE.finditer(block.argument)
+    ):
         raise MarkdownError(block.line, "a fold's title holds no link, as it is a button itself: put the link into the fold")
     body = render(block.text, dialect, block.body_line)
     return dialect.directive(block, body.strip("\n"), _inline(block.argument, dialect, block.line))
@@ -305,12 +315,14 @@ def _choice(line: int, right: bool, text: str, dialect: Dialect) -> Choice:
 
 
 def _inline(text: str, dialect: Dialect, line: int) -> str:
-    """Replace roles and links to chapters; leave code spans and inline maths alone."""
+    """Replace roles and links to chapters and appendices; leave code spans and inline maths alone."""
     _refuse(_INLINE.sub(lambda match: re.sub(r"[^\n]", "x", match[0]), text), line)
 
     def replace(match: re.Match[str]) -> str:
         if match["role"]:
             return dialect.role(match["role"], match["content"].strip(), line + text.count("\n", 0, match.start()))
+        if match["appendix"]:
+            return dialect.appendix(match["appendix"], match["text"])
         return dialect.chapter(int(match["chapter"]), match["text"]) if match["chapter"] else match[0]
 
     return _INLINE.sub(replace, text)

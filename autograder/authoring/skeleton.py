@@ -50,7 +50,8 @@ def write(number: int, title: str, names: list[str], root: Path = paths.ROOT) ->
 
 def _solutions(number: int, title: str, names: list[str]) -> str:
     functions = "\n\n".join(
-        f'def {name}(x):\n    """TODO: one line that says what it computes.\n\n    Args:\n      x: TODO meaning and shape; (B,).\n\n'
+        f'def {name}(x):\n    """TODO: one line that says what it computes.\n\n        y = TODO: the formula\n\n'
+        f"    Args:\n      x: TODO meaning and shape; (B,).\n\n"
         f'    Returns: (B,) TODO.\n    """\n    return 1 * x  # TODO\n'
         for name in names
     )

@@ -33,7 +33,7 @@ from autograder.authoring.chapter import Chapter, all_chapters
 from autograder.paths import BIBLIOGRAPHY, ROOT, RUNS
 from autograder.proving.dependencies import PACKAGES
 from autograder.proving.locks import one_at_a_time
-from autograder.publishing import in_page
+from autograder.publishing import cheat_sheet, in_page
 from autograder.publishing.execution import (
     BookError,
     cache_folder,
@@ -61,6 +61,7 @@ from jupyter_book.cli.main import main
 main(json.loads(sys.stdin.read()))
 """
 HOW_TO = ("how-to/learners", "how-to/teachers", "how-to/platforms", "how-to/contributors")
+APPENDICES = ("cheat-sheet", "notation", "kill-matrix", "practice", "autograd", "format")
 MATHJAX = ("tex-chtml-full.js", "output/chtml/fonts/**/*", "a11y/*", "sre/**/*")
 
 __all__ = ["BookError", "build", "executed_outputs"]
@@ -109,11 +110,13 @@ def staged_files(chapters: list[Chapter], with_solutions: bool) -> dict[str, byt
     files["index.md"] = _front_page(files["index.md"].decode(), chapters).encode()
     files["notation.md"] = notation_page(yaml.safe_load((BOOK / "notation.yml").read_text(encoding="utf-8"))).encode()
     files["format.md"] = format_page().encode()
+    files |= {f"torch/{path.name}": path.read_bytes() for path in (BOOK / "practice" / "torch").glob("*.py")}
     files["_toc.yml"] = yaml.safe_dump(table_of_contents(chapters), sort_keys=False, allow_unicode=True).encode()
     keys = _stage_keys(chapters, with_solutions)
     for chapter in chapters:
         name = f"staged-{chapter.assignment}-{'solved' if with_solutions else 'unsolved'}"
         files |= _kept(name, keys[chapter.assignment], functools.partial(_staged, chapter, with_solutions))
+    files["cheat-sheet.md"] = cheat_sheet.page(chapters, files).encode()
     files |= _kept("staged-kill-matrix", keys["kill-matrix"], functools.partial(_staged_kill_matrix, chapters))
     files |= _kept("staged-practice", keys["practice"], functools.partial(_staged_practice, chapters))
     return files | assets() | practice_files(chapters, files, with_solutions, keys)
@@ -232,7 +235,7 @@ def docname(chapter: Chapter) -> str:
 def table_of_contents(chapters: list[Chapter]) -> dict:
     """sphinx-external-toc's table, from the chapters' front matter."""
     entries = [{"file": docname(chapter), "title": f"{chapter.number}. {chapter.title}"} for chapter in chapters]
-    appendices = [{"file": "notation"}, {"file": "kill-matrix"}, {"file": "practice"}, {"file": "format"}]
+    appendices = [{"file": page} for page in APPENDICES]
     how_to = {"caption": "How to use this book", "chapters": [{"file": page} for page in HOW_TO]}
     parts = [how_to, {"caption": "Chapters", "chapters": entries}, {"caption": "Appendices", "chapters": appendices}]
     return {"format": "jb-book", "root": "index", "parts": parts}

@@ -30,7 +30,16 @@ difficulty: 1
 minutes: 10
 ---
 def td_residuals(rewards, values, gamma):
-    \"\"\"The docstring of the solution, letter for letter.\"\"\"
+    \"\"\"The docstring of the solution, letter for letter.
+
+        δ_t = r_t + γ V(s_{t+1}) - V(s_t)
+
+    Args:
+      rewards, values: (T,).
+      gamma: discount per step.
+
+    Returns: (T - 1,) residuals.
+    \"\"\"
     raise NotImplementedError
 ```
 
@@ -48,7 +57,7 @@ plt.show()
 ```
 
 :::{margin}
-A thought beside the text, on [chapter 43](chapter:43).
+A thought beside the text, on [chapter 43](chapter:43) and the [notation](appendix:notation).
 :::
 
 :::{quiz} What does a residual of zero say?
@@ -72,6 +81,9 @@ def format_page() -> str:
         " says how a chapter is added, and [the page for contributors](how-to/contributors.md) adds one.",
         "All that chapters have, once:",
         PATTERN,
+        "The paragraph of a docstring that is indented further is its formula, with indices as in `s_{t+1}`. It goes to the"
+        " {doc}`cheat sheet <cheat-sheet>` with the first sentence and all shapes; repairs (`repaired_…`) and procedures, which are handed"
+        " a policy, an environment or a network, are left out there.",
         "## Front matter",
         _options(chapter.FRONT_MATTER | chapter.OPTIONAL, optional=chapter.OPTIONAL),
         "## Options of a code cell",

@@ -15,6 +15,19 @@ from pathlib import Path
 import numpy as np
 
 CRF = range(20, 45, 3)  # x264's quality, from good to poor
+NARROWEST = 190  # pixels of a video that stands beside others
+TOGETHER = """<p><button type="button" onclick="
+const all = [...this.closest('.course-videos').querySelectorAll('video')];
+const ready = all.map((video) => {
+  video.pause();
+  video.currentTime = 0;
+  if (video.readyState > 2) return true;
+  video.preload = 'auto';
+  video.load();
+  return new Promise((done) => video.addEventListener('canplay', done, {once: true}));
+});
+Promise.all(ready).then(() => all.forEach((video) => video.play()));
+">Play all from the start</button></p>"""
 
 
 def film(act, env, seed=0, max_steps=1000, fps=25):
@@ -89,7 +102,10 @@ def show_video(path, alt, caption=""):
 
 
 def show_videos(*videos):
-    """Show videos side by side, each given as (path, alt, caption); below one another where the page is narrow."""
+    """Show videos side by side, each given as (path, alt, caption), and a button that starts them together.
+
+    They share the width, and stand below one another where the page is narrow.
+    """
     from IPython.display import display
 
     texts = [f"Video{f' ({caption})' if caption else ''}: {alt}" for _, alt, caption in videos]
@@ -99,7 +115,8 @@ def show_videos(*videos):
 def to_html(*videos) -> str:
     """The self-contained HTML of `show_videos`. Raises: FileNotFoundError for a video without its poster."""
     figures = "".join(_figure(Path(path), alt, caption) for path, alt, caption in videos)
-    return f'<div style="display:flex;flex-wrap:wrap;gap:1em">{figures}</div>'
+    together = TOGETHER.replace("\n", " ") if len(videos) > 1 else ""
+    return f'<div class="course-videos">{together}<div style="display:flex;flex-wrap:wrap;gap:1em">{figures}</div></div>'
 
 
 def _figure(path: Path, alt: str, caption: str) -> str:
@@ -110,10 +127,11 @@ def _figure(path: Path, alt: str, caption: str) -> str:
     label = html.escape(alt, quote=True)
     under = f'<figcaption style="color:#222">{html.escape(caption)}</figcaption>' if caption else ""
     return (
-        f'<figure style="margin:0;background:#fff;flex:0 1 {width}px">'
+        f'<figure style="margin:0;background:#fff;flex:1 1 {NARROWEST}px;max-width:{width}px">'
         f'<video controls muted playsinline preload="none" width="{width}" height="{height}" '
         f'style="width:100%;max-width:{width}px;height:auto" poster="{_uri(path.with_suffix(".webp"), "image/webp")}" '
-        f'aria-label="{label}"><source src="{_uri(path, "video/mp4")}" type="video/mp4">{label}</video>{under}</figure>'
+        f'aria-label="{label}"><source src="{_uri(path, "video/mp4")}" type="video/mp4"></video>'
+        f'{under}<p style="color:#222">{label}</p></figure>'
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from autograder.authoring.chapter import all_chapters
-from autograder.publishing.book import HOW_TO, docname
+from autograder.publishing.book import APPENDICES, HOW_TO, docname
 from tests.book import axe
 
 SCREENSHOTS = Path(__file__).resolve().parents[2] / "test-artefacts"
@@ -16,7 +16,7 @@ LOOKS = {  # colour scheme, width in CSS pixels
     "dark": ("dark", 1280),
     "phone": ("light", 390),
 }
-PAGES = ["index", *HOW_TO, "notation", "kill-matrix", "practice", "format", *(docname(chapter) for chapter in all_chapters())]
+PAGES = ["index", *HOW_TO, *APPENDICES, *(docname(chapter) for chapter in all_chapters())]
 CHAPTERS = [page for page in PAGES if page.startswith("chapters/")]
 
 

@@ -96,11 +96,11 @@ def backward(roots: Sequence[Any], gradients: Sequence[Any], keep: bool = False)
         if step is not None and gradient is not None:
             arrived[step] = arrived[step] + gradient if step in arrived else gradient
 
-    with no_grad():
+    with no_grad():  # gradients are made of tensors, too, and need no history of their own
         for root, gradient in zip(roots, gradients, strict=True):
             add(step_of(root), gradient)
         for step in _latest_first([step_of(root) for root in roots]):
-            if step in arrived:
+            if step in arrived:  # complete: all steps that used this one's result have been visited
                 for source, gradient in zip(step.sources, step.backward(arrived[step], keep), strict=True):
                     add(source, gradient)
     return arrived
@@ -108,7 +108,7 @@ def backward(roots: Sequence[Any], gradients: Sequence[Any], keep: bool = False)
 
 def _latest_first(roots: Sequence[Node | None]) -> Iterator[Node]:
     """All steps behind `roots`, each before those that it was made from."""
-    finished: list[Node] = []
+    finished: list[Node] = []  # each step after those that it was made from: read backwards, the order that is asked for
     seen: set[int] = set()
     waiting: list[tuple[Node, bool]] = [(root, False) for root in roots if root is not None]
     while waiting:
@@ -117,7 +117,7 @@ def _latest_first(roots: Sequence[Node | None]) -> Iterator[Node]:
             finished.append(step)
         elif id(step) not in seen:
             seen.add(id(step))
-            waiting.append((step, True))
+            waiting.append((step, True))  # to be finished once its sources, which now come above it on the stack, are
             waiting.extend((source, False) for source in step.sources if source is not None)
     return reversed(finished)
 
@@ -128,7 +128,7 @@ def _latest_first(roots: Sequence[Node | None]) -> Iterator[Node]:
 def accumulate(output: Any, gradient: Any = None, retain_graph: bool | None = None) -> None:
     """`output.backward()`: add to the `grad` of every leaf behind the output."""
     for step, arrived in backward([output], [start(output, gradient)], bool(retain_graph)).items():
-        if isinstance(step, Leaf):
+        if isinstance(step, Leaf):  # added to what is there, which is why training loops call zero_grad
             step.tensor.grad = arrived.clone() if step.tensor.grad is None else step.tensor.grad + arrived
 
 

@@ -120,6 +120,12 @@ def test_links_to_chapters_lead_to_pages_and_notebooks_or_stay_words():
     assert _render(text, markdown.Book) == "[one](ch43_ppo.ipynb) and two"
 
 
+def test_links_to_appendices_lead_to_pages_and_stay_words_in_notebooks():
+    text = "see [the signs](appendix:notation)"
+    assert _render(text, markdown.Book) == "see [the signs](../notation.md)"
+    assert _render(text) == "see the signs"
+
+
 def test_citations_are_words_in_notebooks_and_prefixed_keys_in_the_book():
     text = "{cite:t}`sutton2018` ({cite:p}`schulman2016, sutton2018`)"
     assert _render(text) == "Sutton and Bärto (2018) ((Schulman et al., 2016; Sutton and Bärto, 2018))"

@@ -254,7 +254,14 @@ def test_table_of_contents_comes_from_the_front_matter(tiny):
     assert sorted(f"{entry['file']}.md" for entry in how_to["chapters"]) == [f"how-to/{path.name}" for path in HOW_TO_PAGES]
     assert [entry["file"] for entry in chapters["chapters"]] == ["chapters/ch98_before", "chapters/ch99_tiny"]
     assert chapters["chapters"][1]["title"] == f"99. {tiny.chapter.title}"
-    assert [entry["file"] for entry in appendices["chapters"]] == ["notation", "kill-matrix", "practice", "format"]
+    assert [entry["file"] for entry in appendices["chapters"]] == [
+        "cheat-sheet",
+        "notation",
+        "kill-matrix",
+        "practice",
+        "autograd",
+        "format",
+    ]
 
 
 def test_notation_page_has_every_name_and_keeps_bars_inside_their_cells():
@@ -419,9 +426,11 @@ def test_only_pages_and_what_they_show_is_published(bare):
     tops = {path.relative_to(bare).parts[0] for path in bare.rglob("*") if path.is_file()}
     assert tops == {
         "index.html",
+        "cheat-sheet.html",
         "notation.html",
         "kill-matrix.html",
         "practice.html",
+        "autograd.html",
         "format.html",
         "search.html",
         "searchindex.js",

@@ -71,7 +71,7 @@ def test_the_page_gets_words_and_nothing_from_elsewhere(lander, monkeypatch):
     path, _ = lander
     page = videos.to_html((path, 'It falls & "crashes".', "first"), (path, "It lands.", "last"))
     assert page.count("<video ") == 2 and "autoplay" not in page and page.count('preload="none"') == 2
-    assert page.count("It falls &amp; &quot;crashes&quot;.") == 2, "as label and as fallback"
+    assert page.count("It falls &amp; &quot;crashes&quot;.") == 2, "as label and under the video"
     assert '<figcaption style="color:#222">first</figcaption>' in page
     assert all(source.startswith("data:") for source in re.findall(r'(?:src|poster)="([^"]+)"', page))
     shown = []
@@ -100,3 +100,23 @@ def test_a_browser_plays_it_from_a_file_when_asked(browser, lander, tmp_path):
         assert state[3] == pytest.approx(len(frames) / 25, abs=0.1)
         page.set_viewport_size({"width": 360, "height": 700})
         assert video.bounding_box()["width"] <= 360
+
+
+def test_videos_side_by_side_start_together_with_one_button(browser, lander, tmp_path):
+    path, _ = lander
+    head = "<!doctype html><html lang=en><meta charset=utf-8><title>t</title><body>"
+    three = [(path, f"The lander falls, {time} time.", time) for time in ("first", "second", "third")]
+    (tmp_path / "page.html").write_text(head + videos.to_html(*three) + videos.to_html((path, "Alone.", "")))
+    with browser.new_context(offline=True, viewport={"width": 720, "height": 700}) as context:
+        page = context.new_page()
+        page.goto((tmp_path / "page.html").as_uri())
+        assert len({one.bounding_box()["y"] for one in page.locator("video").all()[:3]}) == 1, "they share the width of a page"
+        page.evaluate("document.querySelectorAll('video')[1].currentTime = 3")
+        page.get_by_role("button").focus()  # one alone has its own control, and no button
+        page.keyboard.press("Enter")
+        page.wait_for_function("[...document.querySelectorAll('video')].slice(0, 3).every((one) => one.currentTime > 0.2)")
+        times = page.evaluate("[...document.querySelectorAll('video')].map((one) => one.currentTime)")
+        assert max(times[:3]) - min(times[:3]) < 0.5 and times[3] == 0
+        page.set_viewport_size({"width": 390, "height": 700})
+        boxes = [one.bounding_box() for one in page.locator("video").all()[:3]]
+        assert boxes[0]["y"] < boxes[1]["y"] < boxes[2]["y"] and boxes[0]["width"] <= 390, "stacked on a phone"
