@@ -114,7 +114,7 @@ def staged_files(chapters: list[Chapter], with_solutions: bool) -> dict[str, byt
     files["_toc.yml"] = yaml.safe_dump(table_of_contents(chapters), sort_keys=False, allow_unicode=True).encode()
     keys = _stage_keys(chapters, with_solutions)
     [figure] = _kept("staged-clip", keys["clip"], _staged_clip).values()
-    files["index.md"] = front_page.front_page(files["index.md"].decode(), chapters, figure.decode()).encode()
+    files["index.md"] = front_page.front_page(files["index.md"].decode(), chapters, figure.decode(), with_solutions).encode()
     files |= {name: path.read_bytes() for name, path in front_page.LANDING.items()}
     for chapter in chapters:
         name = f"staged-{chapter.assignment}-{'solved' if with_solutions else 'unsolved'}"
@@ -168,8 +168,8 @@ def _kept(name: str, key: str, make: Callable[[], tuple[dict[str, bytes], bool]]
 
 
 def _stage_keys(chapters: list[Chapter], with_solutions: bool) -> dict[str, str]:
-    """Of each chapter, of the kill matrix, of what pages can judge, and of what they are handed for it, a hash of all that its part of
-    the stage rests on: for a chapter its own text and outputs, the names of pages and exercises in all others, and all code, as
+    """Of each chapter, of the kill matrix, of what pages can judge, of what they are handed for it, and of the front page's figure, a
+    hash of all that its part of the stage rests on: for a chapter its own text and outputs, the names of pages and exercises in all others, and all code, as
     references and checks may take anything from it."""
     code = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
     common = content_hash((), [*code, BIBLIOGRAPHY, ROOT / "requirements.txt", ROOT / "constraints.txt"])

@@ -17,6 +17,7 @@ from autograder.paths import RUNS
 
 LANDING = {f"vendor/landing{suffix}": RUNS / "lander" / f"ours-0.final{suffix}" for suffix in (".mp4", ".webp")}
 LINK = re.compile(r"\[([^\]]+)\]\(chapter:(\d+)(#[\w-]+)?\)")
+READING = "each figure of a chapter has its code beside it, and each exercise a folded solution"
 STEP, GAP = 62, 42  # from one number on the map to the next, across and down, in its own pixels
 NUMBER = (42, 28)  # the size of one
 NOTES = {  # what a line of llms.txt says of the pages that are no chapters
@@ -41,7 +42,7 @@ def heading(chapter: Chapter) -> str:
     return f"{chapter.number}. {chapter.title}"
 
 
-def front_page(text: str, chapters: Sequence[Chapter], figure: str) -> str:
+def front_page(text: str, chapters: Sequence[Chapter], figure: str, with_solutions: bool = True) -> str:
     """The page in MyST from book/index.md: `text` with its marks replaced, and links to chapters, [words](chapter:44#a-heading), written
     out; a chapter that is not there leaves the words."""
     pages = {chapter.number: docname(chapter) for chapter in chapters}
@@ -57,6 +58,7 @@ def front_page(text: str, chapters: Sequence[Chapter], figure: str) -> str:
         "clip": figure,
         "size": f"{len(chapters)} chapters, {exercises} exercises, about {hours} hours",
         "map": _map(chapters),
+        "reading": READING if with_solutions else "this edition shows no solutions",
         "chapters": "\n".join(_entry(chapter) for chapter in chapters),
     }
     for name, content in marks.items():
@@ -199,7 +201,7 @@ def llms_txt(chapters: Sequence[Chapter], pages: Mapping[str, str]) -> str:
         "> An interactive book on policy gradient methods, from PPO's clipped objective to direct preference optimisation of language"
         " models. Its readers write each method's functions, and checks that know the usual mistakes by name answer at once.",
         "",
-        "Each chapter has its derivations, exercises with hints and folded solutions, experiments, pitfalls and questions. Whoever asks"
+        "Each chapter has its derivations, exercises with hints, experiments, pitfalls and questions. Whoever asks"
         " about an exercise wants to solve it: help with one hint at a time, as the page for learners says, and not with its code.",
     ]
     for part, entries in parts.items():

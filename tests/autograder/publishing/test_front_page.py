@@ -62,8 +62,10 @@ def test_links_to_chapters_are_written_out_and_an_unknown_one_leaves_its_words(t
 
 def test_every_mark_of_the_page_is_replaced():
     text = (book.BOOK / "index.md").read_text(encoding="utf-8")
-    assert len(re.findall(r"<!-- \w+ -->", text)) == 5
-    assert "<!-- " not in front_page.front_page(text, all_chapters(), "")
+    assert len(re.findall(r"<!-- \w+ -->", text)) == 6
+    with_solutions, without = (front_page.front_page(text, all_chapters(), "", solved) for solved in (True, False))
+    assert "<!-- " not in with_solutions + without
+    assert front_page.READING in with_solutions and "each exercise a folded solution" not in without
 
 
 def test_the_figure_shows_the_clip_on_the_side_where_it_acts():
