@@ -189,7 +189,7 @@ def _front(chapter: Chapter, sources: Sources) -> str:
         graded.append(f"open questions for a teacher ({total})")
     lines = [
         f"# {chapter.number}. {chapter.title}\n",
-        f"- **Time:** {_duration(chapter.minutes)}",
+        f"- **Time:** {duration(chapter.minutes)}",
         f"- **Before this:** {before}" if before else "",
         f"- **You will have built:** {chapter.builds}",
         f"- **Graded:** {', '.join(graded)}",
@@ -203,7 +203,7 @@ def _introduced(text: str, stub: Cell, number: str, chapter: Chapter) -> str:
     if not headings:
         raise _unannounced(chapter, stub)
     last = headings[-1]
-    facts = f"`{stub.exercise}` · difficulty {_LEVELS[stub.difficulty]} · {_duration(stub.minutes)}"
+    facts = f"`{stub.exercise}` · difficulty {_LEVELS[stub.difficulty]} · {duration(stub.minutes)}"
     return f"{text[: last.start()]}{last[1]} Exercise {number}: {last[2]}\n\n{facts}{text[last.end() :]}"
 
 
@@ -328,7 +328,7 @@ def _points(points: float) -> str:
     return f"{points:g} point{'' if points == 1 else 's'}"
 
 
-def _duration(minutes: int) -> str:
+def duration(minutes: int) -> str:
     hours, rest = divmod(minutes, 60)
     words = [f"{hours} hour{'s' * (hours > 1)}"] * (hours > 0) + [f"{rest} minutes"] * (rest > 0)
     return f"about {' '.join(words)}"

@@ -32,11 +32,12 @@ FRONT_MATTER = {
     "chapter": Option(int, "The chapter's number NN; its file is called `chNN_name.md`."),
     "title": Option(str, "The title, without the number."),
     "minutes": Option(int, "How long a learner needs, exercises included."),
-    "prerequisites": Option(list, "The numbers of the chapters to read before this one; `[]` if there are none."),
+    "prerequisites": Option(list, "The numbers of the chapters to read before this one, all lower; `[]` if there are none."),
     "builds": Option(str, "What the learner will have built, to follow *You will have built:*."),
     "summary": Option(str, "What the chapter is about, for the list on the front page: a sentence or two."),
 }
 OPTIONAL = {
+    "assumes": Option(str, "What one has to know besides these chapters, in a few words, for the list on the front page."),
     "experiments": Option(list, "The experiments whose records the page loads; they are handed out with the notebook."),
 }
 OPTIONS = {
@@ -108,6 +109,7 @@ class Chapter:
     summary: str
     cells: tuple[Cell, ...]
     experiments: tuple[str, ...] = ()  # whose records its pages load
+    assumes: str = ""
 
     @property
     def assignment(self) -> str:
@@ -140,8 +142,16 @@ def load(name: int | str, directory: Path | None = None) -> Chapter:
 
 
 def all_chapters(directory: Path | None = None) -> list[Chapter]:
-    """Every chapter, in the order of their numbers."""
-    return [parse(path) for path in _sources(directory).values()]
+    """Every chapter, in the order of their numbers. Raises ChapterError if one names a prerequisite that does not come before it."""
+    chapters = [parse(path) for path in _sources(directory).values()]
+    for chapter in chapters:
+        before = [other.number for other in chapters if other.number < chapter.number]
+        if unknown := [one for one in chapter.prerequisites if one not in before]:
+            names = ", ".join(map(str, before)) or "none"
+            raise ChapterError(
+                chapter.path, 1, f"prerequisites: {unknown[0]!r} is no chapter before this one; those are: {names}"
+            )
+    return chapters
 
 
 def page_files(directory: Path | None = None) -> dict[int, Path]:
@@ -185,6 +195,7 @@ def parse(path: Path) -> Chapter:
         front["summary"],
         cells,
         tuple(front.get("experiments", ())),
+        front.get("assumes", ""),
     )
 
 

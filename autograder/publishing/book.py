@@ -33,7 +33,7 @@ from autograder.authoring.chapter import Chapter, all_chapters
 from autograder.paths import BIBLIOGRAPHY, ROOT, RUNS
 from autograder.proving.dependencies import PACKAGES
 from autograder.proving.locks import one_at_a_time
-from autograder.publishing import cheat_sheet, in_page
+from autograder.publishing import cheat_sheet, front_page, in_page
 from autograder.publishing.execution import (
     BookError,
     cache_folder,
@@ -45,6 +45,7 @@ from autograder.publishing.execution import (
     run_all,
 )
 from autograder.publishing.format_page import format_page
+from autograder.publishing.front_page import docname, heading
 from autograder.publishing.located import relocated
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
 
 BOOK = ROOT / "book"
 STAGE = BOOK / "_stage"
-PUBLISHED = ("*.html", "searchindex.js", "_static/*", "_images/*", "_downloads/*")
+PUBLISHED = ("*.html", "llms.txt", "searchindex.js", "_static/*", "_images/*", "_downloads/*")
 JUPYTER_BOOK = """
 import json, sys
 sys.modules["rfc3987_syntax"] = None  # as in autograder.cli
@@ -64,7 +65,7 @@ HOW_TO = ("how-to/learners", "how-to/teachers", "how-to/platforms", "how-to/cont
 APPENDICES = ("cheat-sheet", "notation", "kill-matrix", "practice", "autograd", "format")
 MATHJAX = ("tex-chtml-full.js", "output/chtml/fonts/**/*", "a11y/*", "sre/**/*")
 
-__all__ = ["BookError", "build", "executed_outputs"]
+__all__ = ["BookError", "build", "docname", "executed_outputs"]
 
 
 def build(with_solutions: bool = True, out: Path | None = None) -> Path:
@@ -89,6 +90,7 @@ def build(with_solutions: bool = True, out: Path | None = None) -> Path:
             if sync(files, stage) | _is_framed_anew(files, work):
                 shutil.rmtree(work, ignore_errors=True)  # Sphinx never deletes the page of a source that has gone
             renderer.render(stage, work, chapters)
+        shutil.copyfile(stage / "llms.txt", work / "_build" / "html" / "llms.txt")
         publish(work / "_build" / "html", out)
         _seal_path(out).write_text(json.dumps({"key": key, "files": _listing(out)}), encoding="utf-8")
     return out
@@ -107,19 +109,27 @@ def staged_files(chapters: list[Chapter], with_solutions: bool) -> dict[str, byt
     """Everything that Sphinx reads, by path relative to the staging folder."""
     pages = [*BOOK.glob("*.md"), *BOOK.glob("how-to/*.md"), *BOOK.glob("*.bib")]
     files = {path.relative_to(BOOK).as_posix(): path.read_bytes() for path in pages}
-    files["index.md"] = _front_page(files["index.md"].decode(), chapters).encode()
     files["notation.md"] = notation_page(yaml.safe_load((BOOK / "notation.yml").read_text(encoding="utf-8"))).encode()
     files["format.md"] = format_page().encode()
     files |= {f"torch/{path.name}": path.read_bytes() for path in (BOOK / "practice" / "torch").glob("*.py")}
     files["_toc.yml"] = yaml.safe_dump(table_of_contents(chapters), sort_keys=False, allow_unicode=True).encode()
     keys = _stage_keys(chapters, with_solutions)
+    [figure] = _kept("staged-clip", keys["clip"], _staged_clip).values()
+    files["index.md"] = front_page.front_page(files["index.md"].decode(), chapters, figure.decode(), with_solutions).encode()
+    files |= {name: path.read_bytes() for name, path in front_page.LANDING.items()}
     for chapter in chapters:
         name = f"staged-{chapter.assignment}-{'solved' if with_solutions else 'unsolved'}"
         files |= _kept(name, keys[chapter.assignment], functools.partial(_staged, chapter, with_solutions))
     files["cheat-sheet.md"] = cheat_sheet.page(chapters, files).encode()
     files |= _kept("staged-kill-matrix", keys["kill-matrix"], functools.partial(_staged_kill_matrix, chapters))
     files |= _kept("staged-practice", keys["practice"], functools.partial(_staged_practice, chapters))
+    others = {name: files[f"{name}.md"].decode() for name in (*HOW_TO, *APPENDICES)}
+    files["llms.txt"] = front_page.llms_txt(chapters, others).encode()  # which Sphinx does not look at
     return files | assets() | practice_files(chapters, files, with_solutions, keys)
+
+
+def _staged_clip() -> tuple[dict[str, bytes], bool]:
+    return {"clip.html": front_page.clip_figure().encode()}, True
 
 
 def _staged(chapter: Chapter, with_solutions: bool) -> tuple[dict[str, bytes], bool]:
@@ -131,7 +141,7 @@ def _staged_kill_matrix(chapters: list[Chapter]) -> tuple[dict[str, bytes], bool
     from autograder.proving import kept  # loads torch, as the checks themselves do
 
     keys = kept.Keys()
-    matrix = {f"{chapter.number}. {chapter.title}": kill_rows(chapter, keys) for chapter in chapters}
+    matrix = {heading(chapter): kill_rows(chapter, keys) for chapter in chapters}
     proved = not any("unproved" in row for rows in matrix.values() for row in rows)
     return {"kill-matrix.md": kill_matrix_page(matrix).encode()}, proved
 
@@ -142,7 +152,7 @@ def _staged_practice(chapters: list[Chapter]) -> tuple[dict[str, bytes], bool]:
     from autograder.publishing.practice_page import practice_page, practice_rows
 
     keys = practice.Keys()
-    judged = {f"{chapter.number}. {chapter.title}": practice_rows(chapter, keys) for chapter in chapters}
+    judged = {heading(chapter): practice_rows(chapter, keys) for chapter in chapters}
     proved = not any("unproved" in row for rows in judged.values() for row in rows)
     return {"practice.md": practice_page(judged).encode()}, proved
 
@@ -160,9 +170,9 @@ def _kept(name: str, key: str, make: Callable[[], tuple[dict[str, bytes], bool]]
 
 
 def _stage_keys(chapters: list[Chapter], with_solutions: bool) -> dict[str, str]:
-    """Of each chapter, of the kill matrix, of what pages can judge, and of what they are handed for it, a hash of all that its part of
-    the stage rests on: for a chapter its own text and outputs, the names of pages and exercises in all others, and all code, as
-    references and checks may take anything from it."""
+    """Of each chapter, of the kill matrix, of what pages can judge, of what they are handed for it, and of the front page's figure, a
+    hash of all that its part of the stage rests on: for a chapter its own text and outputs, the names of pages and exercises in all
+    others, and all code, as references and checks may take anything from it."""
     code = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
     common = content_hash((), [*code, BIBLIOGRAPHY, ROOT / "requirements.txt", ROOT / "constraints.txt"])
     names = [f"{chapter.page} {[cell.exercise for cell in chapter.exercises]}" for chapter in chapters]
@@ -170,7 +180,7 @@ def _stage_keys(chapters: list[Chapter], with_solutions: bool) -> dict[str, str]
         chapter.assignment: content_hash([common, str(with_solutions), *names], [chapter.path, cached(chapter)])
         for chapter in chapters
     }
-    titles = [f"{chapter.number}. {chapter.title}" for chapter in chapters]
+    titles = [heading(chapter) for chapter in chapters]
     records = [BOOK / "kill-matrix.md", *kept_records(), *RUNS.glob("*/*.parquet")]
     cells = [cell.source for chapter in chapters for cell in chapter.cells if cell.kind == "code"]
     judging = content_hash([common, *cells], [*sorted((BOOK / "practice").rglob("*.py")), *kept_records()])
@@ -178,6 +188,7 @@ def _stage_keys(chapters: list[Chapter], with_solutions: bool) -> dict[str, str]
         "kill-matrix": content_hash([common, *titles], records),
         "practice": content_hash([judging, *titles], [BOOK / "practice.md"]),
         "handed": content_hash([judging, str(with_solutions)], []),
+        "clip": content_hash([common], sorted((ROOT / "course_lib" / "static").glob("explorer.*"))),
     }
 
 
@@ -227,14 +238,9 @@ def _staged_page(chapter: Chapter, with_solutions: bool) -> tuple[dict[str, byte
     return {chapter.assignment: json.dumps(in_page.handed_to(chapter, with_solutions)).encode()}, True
 
 
-def docname(chapter: Chapter) -> str:
-    """The page of a chapter, without suffix, relative to the front page."""
-    return f"chapters/{chapter.page}"
-
-
 def table_of_contents(chapters: list[Chapter]) -> dict:
     """sphinx-external-toc's table, from the chapters' front matter."""
-    entries = [{"file": docname(chapter), "title": f"{chapter.number}. {chapter.title}"} for chapter in chapters]
+    entries = [{"file": docname(chapter), "title": heading(chapter)} for chapter in chapters]
     appendices = [{"file": page} for page in APPENDICES]
     how_to = {"caption": "How to use this book", "chapters": [{"file": page} for page in HOW_TO]}
     parts = [how_to, {"caption": "Chapters", "chapters": entries}, {"caption": "Appendices", "chapters": appendices}]
@@ -269,8 +275,8 @@ def _plain(text: str) -> str:
 def kill_matrix_page(matrix: dict[str, list[dict]]) -> str:
     """The appendix on how the checks were tested, from each chapter's heading and rows (`kill_rows`)."""
     lines = [(BOOK / "kill-matrix.md").read_text(encoding="utf-8").rstrip(), ""]
-    for heading, rows in matrix.items():
-        lines += [f"## {heading}", ""]
+    for title, rows in matrix.items():
+        lines += [f"## {title}", ""]
         for row in rows:
             if "unproved" in row:
                 lines += [f"### `{row['exercise']}`", "", row["unproved"], ""]
@@ -332,12 +338,6 @@ def kill_rows(chapter: Chapter, keys: Keys | None = None) -> list[dict]:
         else:
             rows.append({"exercise": exercise.name} | known[exercise.name].rows)
     return rows
-
-
-def _front_page(text: str, chapters: list[Chapter]) -> str:
-    """The front page with the list of chapters in the place of its marker."""
-    entries = [f"- [**{c.number}. {c.title}**]({docname(c)}.ipynb) ({c.minutes} minutes). {c.summary}" for c in chapters]
-    return text.replace("<!-- chapters -->", "\n".join(entries))
 
 
 def assets() -> dict[str, bytes]:
@@ -444,7 +444,7 @@ def _build_key(chapters: list[Chapter], with_solutions: bool) -> str:
     more of the code than their outputs rest on, and rendering them again is quick."""
     own = [path for path in BOOK.rglob("*") if path.is_file() and not path.relative_to(BOOK).parts[0].startswith("_")]
     code = [path for folder in ("autograder", "course_lib", "solutions") for path in (ROOT / folder).rglob("*.py")]
-    kept = [*kept_records(), ROOT / "requirements.txt", ROOT / "constraints.txt"]
+    kept = [*kept_records(), *front_page.LANDING.values(), ROOT / "requirements.txt", ROOT / "constraints.txt"]
     chapters_own = [chapter.path for chapter in chapters]
     outputs = [execution_key(chapter) for chapter in chapters]
     return content_hash(

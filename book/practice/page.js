@@ -160,6 +160,32 @@ function progress() {
       link.append(element("span", {className: "practice-done"}, mark, words));
     });
   }
+  overview();
+}
+
+// On the front page: what is passed in all, and of each chapter on the map; and the chapter to go on with.
+function overview() {
+  const place = document.querySelector(".course-progress");
+  if (!place) return;
+  const each = Object.values(chapters).map(({page, exercises}) => ({
+    page,
+    of: exercises.length,
+    passed: exercises.filter((name) => store.passed(name)).length,
+    begun: exercises.some((name) => store.passed(name) || store.draft(name) !== null),
+  }));
+  for (const {page, of, passed} of each) {
+    const link = document.querySelector(`.course-map a[href$="${page}.html"]`);
+    if (!link) continue;
+    const title = link.querySelector("title").textContent;
+    link.setAttribute("aria-label", passed ? `${title}: ${passed} of ${of} exercises passed` : title);
+    link.dataset.done = passed === of ? "all" : passed ? "some" : "none";
+  }
+  const sum = (what) => each.reduce((total, one) => total + one[what], 0);
+  const next = each.find(({begun, passed, of}) => begun && passed < of);
+  const title = next && document.querySelector(`article li a[href$="${next.page}.html"] strong`).textContent;
+  place.replaceChildren(
+    ...(next ? [element("a", {href: `chapters/${next.page}.html`}, `Continue with ${title}`), " "] : []),
+    `${sum("passed")} of ${sum("of")} exercises on these pages passed. ${keeping()}`);
 }
 
 // What becomes of drafts, where that is not what one expects.

@@ -1,3 +1,5 @@
+import shutil
+
 import pytest
 
 from autograder.authoring import chapter
@@ -15,7 +17,7 @@ def _edited(tiny, tmp_path, old, new, name="ch99_tiny.md"):
 def test_front_matter_and_options_are_read(tiny):
     read = tiny.chapter
     assert (read.number, read.assignment, read.page, read.title) == (99, "ch99", "ch99_tiny", "A tiny chapter: twice")
-    assert (read.minutes, read.prerequisites, read.summary) == (90, (98, 1), "A chapter for tests.")
+    assert (read.minutes, read.prerequisites, read.summary) == (90, (98,), "A chapter for tests.")
     assert [(cell.exercise, cell.difficulty, cell.minutes) for cell in read.exercises] == [("double", 1, 5), ("quadruple", 3, 70)]
     assert [(cell.open_question, cell.points) for cell in read.open_questions] == [("why_double", 2)]
     assert [sorted(cell.tags) for cell in read.cells if cell.tags] == [["hide-input", "live"], ["book-only", "live"]]
@@ -32,6 +34,14 @@ def test_lines_point_into_the_file(tiny):
 def test_chapters_are_found_by_number_and_by_name_and_listed_in_order(tiny):
     assert chapter.load("ch98", tiny.directory) == chapter.load(98, tiny.directory) == tiny.before
     assert [found.number for found in chapter.all_chapters(tiny.directory)] == [98, 99]
+
+
+@pytest.mark.parametrize("number", ["1", "99", "100", "'98'"])
+def test_a_prerequisite_is_a_chapter_that_comes_before(tiny, tmp_path, number):
+    shutil.copy(tiny.before.path, tmp_path)
+    _edited(tiny, tmp_path, "prerequisites: [98]", f"prerequisites: [98, {number}]")
+    with pytest.raises(ChapterError, match=rf"ch99_tiny\.md:1: prerequisites: {number} is no chapter before .* those are: 98$"):
+        chapter.all_chapters(tmp_path)
 
 
 def test_an_unknown_chapter_is_answered_with_those_that_exist(tiny):

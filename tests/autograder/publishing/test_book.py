@@ -397,7 +397,7 @@ def bare(tiny, tmp_path_factory):
         patch.setattr(
             book,
             "_stage_keys",
-            lambda chapters, with_solutions: dict.fromkeys(("ch98", "ch99", "kill-matrix", "practice", "handed"), "tiny"),
+            lambda chapters, with_solutions: dict.fromkeys(("ch98", "ch99", "kill-matrix", "practice", "handed", "clip"), "tiny"),
         )
         patch.setattr(book, "cache_folder", lambda: folder)
         patch.setattr(book, "STAGE", folder / "stage")
@@ -434,6 +434,7 @@ def test_only_pages_and_what_they_show_is_published(bare):
         "format.html",
         "search.html",
         "searchindex.js",
+        "llms.txt",
         "how-to",
         "chapters",
         "_static",
