@@ -48,7 +48,7 @@
       for (const [px, py] of points) {
         if (series.kind === "bar")
           make(svg, "rect", {...paint, x: x(px) - bar / 2, width: bar, y: Math.min(y(py), y(0)), height: Math.abs(y(py) - y(0))});
-        else if (series.kind === "points" || whose !== "mine")
+        else if (series.kind === "points" || !whose)
           make(svg, "circle", {class: `points c${index % 5} ${whose}`, cx: x(px), cy: y(py), r: series.kind === "line" ? 2.5 : 4});
       }
     };
