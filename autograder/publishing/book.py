@@ -184,11 +184,12 @@ def _stage_keys(chapters: list[Chapter], with_solutions: bool) -> dict[str, str]
     records = [BOOK / "kill-matrix.md", *kept_records(), *RUNS.glob("*/*.parquet")]
     cells = [cell.source for chapter in chapters for cell in chapter.cells if cell.kind == "code"]
     judging = content_hash([common, *cells], [*sorted((BOOK / "practice").rglob("*.py")), *kept_records()])
+    handed = {f"handed-{one.assignment}": content_hash([judging, str(with_solutions)], [cached(one)]) for one in chapters}
     return keys | {
         "kill-matrix": content_hash([common, *titles], records),
         "practice": content_hash([judging, *titles], [BOOK / "practice.md"]),
-        "handed": content_hash([judging, str(with_solutions)], []),
         "clip": content_hash([common], sorted((ROOT / "course_lib" / "static").glob("explorer.*"))),
+        **handed,
     }
 
 
@@ -226,7 +227,7 @@ def practice_files(
         make = functools.partial(_staged_page, chapter, with_solutions)
         if keys:
             name = f"handed-to-{chapter.assignment}-{'solved' if with_solutions else 'unsolved'}"
-            [content] = _kept(name, keys["handed"], make).values()
+            [content] = _kept(name, keys[f"handed-{chapter.assignment}"], make).values()
         else:
             [content] = make()[0].values()
         pages.append((chapter, json.loads(content)))
@@ -235,7 +236,8 @@ def practice_files(
 
 
 def _staged_page(chapter: Chapter, with_solutions: bool) -> tuple[dict[str, bytes], bool]:
-    return {chapter.assignment: json.dumps(in_page.handed_to(chapter, with_solutions)).encode()}, True
+    handed = in_page.handed_to(chapter, executed_outputs(chapter), with_solutions)
+    return {chapter.assignment: json.dumps(handed).encode()}, True
 
 
 def table_of_contents(chapters: list[Chapter]) -> dict:

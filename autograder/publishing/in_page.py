@@ -27,6 +27,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from autograder.authoring import assemble
 from autograder.authoring.chapter import Chapter
 from autograder.paths import ROOT
 from autograder.publishing.execution import cache_folder, content_hash
@@ -69,7 +70,8 @@ def staged(pages: Sequence[tuple[Chapter, Mapping[str, Any]]], notebooks: Mappin
     """The files for the staging folder, by path.
 
     Args:
-      pages: chapters whose pages are built, with the `exercises` that each offers and the `text` that it is handed (`handed_to`).
+      pages: chapters whose pages are built, with the `exercises` that each offers, the `figures` that draw them, and the `text` that
+        it is handed (`handed_to`).
       notebooks: the learners' notebooks of chapters, by assignment.
     """
     files = {"vendor/practice.css": (SOURCES / "practice.css").read_bytes()}
@@ -78,7 +80,9 @@ def staged(pages: Sequence[tuple[Chapter, Mapping[str, Any]]], notebooks: Mappin
         return files | {"vendor/practice.js": WITHOUT.encode()}
     from autograder.proving import practice
 
-    index = {c.assignment: {"page": c.page, "exercises": of["exercises"]} for c, of in pages if of["exercises"]}
+    index = {
+        c.assignment: {"page": c.page} | {key: of[key] for key in ("exercises", "figures")} for c, of in pages if of["exercises"]
+    }
     for chapter, of in pages:
         if of["exercises"]:
             files[f"vendor/practice/{chapter.assignment}.js"] = script(chapter.assignment, of["text"].encode())
@@ -93,19 +97,32 @@ def staged(pages: Sequence[tuple[Chapter, Mapping[str, Any]]], notebooks: Mappin
     return files | {"vendor/practice.js": f"window.coursePractice = {{index: {told}}};\n".encode() + page}
 
 
-def handed_to(chapter: Chapter, with_solutions: bool) -> dict[str, Any]:
-    """The `exercises` that a chapter's page offers, and the `text` that its judge is given: without the book's answers, if they are not
-    to be shown; "" if it offers none."""
-    from autograder.proving import practice
+def handed_to(chapter: Chapter, outputs: assemble.Outputs, with_solutions: bool) -> dict[str, Any]:
+    """The `exercises` that a chapter's page offers, by title the `figures` that draw some of them, with their names, and the `text` that
+    its judge is given: without the book's answers, if they are not to be shown; "" if it offers none.
+
+    Args:
+      chapter: a line says which of its figures call exercises that are offered, but can't be drawn in the page.
+      outputs: of its cells, with the values that the book records.
+    """
+    from autograder.proving import drawing, practice
 
     names = practice.offered_in(chapter.assignment)
     text = practice.page_of(chapter, names) if names else ""
-    if text and not with_solutions:
+    found = drawing.figures(chapter, names)
+    reasons = drawing.reasons(chapter, found, outputs)
+    for title, reason in reasons.items():
+        if reason:
+            print(f"{chapter.assignment}: {title!r} is not drawn with the reader's code: {reason}", flush=True)
+    drawn = [one for one in found if not reasons[one.title]]
+    if text:
         data = json.loads(text)
-        for page in (data["page"], *data["page"]["earlier"].values()):
-            page["answers"] = {}
+        data["page"]["figures"] = drawing.told(drawn)
+        if not with_solutions:
+            for page in (data["page"], *data["page"]["earlier"].values()):
+                page["answers"] = {}
         text = json.dumps(data, ensure_ascii=False)
-    return {"exercises": names, "text": text}
+    return {"exercises": names, "figures": {one.title: list(one.uses) for one in drawn}, "text": text}
 
 
 def script(name: str, content: bytes) -> bytes:

@@ -54,21 +54,17 @@ class Engine {
     };
     this.#worker.onerror = (event) => this.end(new Error(event.message || "the worker failed"));
     this.#worker.onmessageerror = () => this.end(new Error("the worker got a message that it could not read"));
-    this.ready = loaded(chapter).then((given) => this.#ask("boot", given));
+    this.ready = loaded(chapter).then((given) => this.ask("boot", given));
     this.ready.catch(() => {}); // whoever waits for it is told
   }
 
-  #ask(task, given) {
+  ask(task, given) {
     return new Promise((resolve, reject) => {
       if (this.#ended) throw this.#ended;
       const id = ++this.#asked;
       this.#waiting.set(id, {resolve, reject});
-      this.#worker.postMessage({id, task, ...given});
+      this.#worker.postMessage({id, task, given});
     });
-  }
-
-  check(name, source, others) {
-    return this.#ask("check", {name, source, others});
   }
 
   end(reason) {
@@ -78,17 +74,25 @@ class Engine {
   }
 }
 
-let engine, checking = Promise.resolve();
+let engine, asking = Promise.resolve();
 
 // The verdict on an answer to one of the chapter's exercises; of several that are asked for, one after the other.
 // `others` has the reader's answers to other exercises, which this one may call; `told` is called with "starting" and "running".
-export function check(chapter, name, source, others = {}, told = () => {}) {
-  const verdict = checking.then(() => one(chapter, name, source, others, told));
-  checking = verdict.catch(() => {});
-  return verdict;
+export const check = (chapter, name, source, others = {}, told = () => {}) => ask(chapter, "check", [name, source, others], told);
+
+// What a figure shows of the reader's answers: values, or a sentence that says why there are none. Likewise one after the other.
+export async function draw(chapter, title, positions, answers, told = () => {}) {
+  const {values, sentence, message} = await ask(chapter, "draw", [title, positions, answers], told);
+  return {values, sentence: sentence ?? message, ended: message !== undefined};
 }
 
-async function one(chapter, name, source, others, told) {
+function ask(chapter, task, given, told) {
+  const answer = asking.then(() => one(chapter, task, given, told));
+  asking = answer.catch(() => {});
+  return answer;
+}
+
+async function one(chapter, task, given, told) {
   told(engine?.runs ? "running" : "starting");
   engine ??= new Engine(chapter);
   const own = engine;
@@ -98,7 +102,7 @@ async function one(chapter, name, source, others, told) {
     own.runs = true;
     told("running");
     clock = setTimeout(() => stop(`It did not finish within ${LIMIT / 1000} seconds. Is there a loop that never ends?`), LIMIT);
-    return await own.check(name, source, others);
+    return await own.ask(task, given);
   } catch (error) {
     if (error instanceof Stopped) return {state: "timeout", misconceptions: [], message: error.message};
     if (engine === own) engine = undefined; // the next check tries anew

@@ -1,7 +1,7 @@
 """Judge an answer that was written on a page of the book: the notebook's own comparing code, on the page's torch.
 
 The page hands over a text that `autograder.proving.practice.page_of` made (`open_page`); then `check(name, source)` says of the text of
-a cell what the notebook would say.
+a cell what the notebook would say, and `draw(title, positions)` what one of the page's figures shows of it.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import elsewhere
+import figures
 import torch
 from torch import missing  # type: ignore[attr-defined]  # of the page's torch
 
@@ -41,13 +42,15 @@ def _library(folder: Path) -> None:
 
 @dataclasses.dataclass
 class Page:
-    """What a page knows: the cells that set its chapter up, the book's own answers by name, frozen cases by name, and the same cells and
-    answers of earlier chapters."""
+    """What a page knows: the cells that set its chapter up, the book's own answers by name, frozen cases by name, the same cells and
+    answers of earlier chapters, and by title the figures that draw answers: the `source` that gives a function to `explore`, and the
+    exercises that it `uses`."""
 
     setup: list[str]
     answers: dict[str, str]
     cases: dict[str, str] = dataclasses.field(default_factory=dict)
     earlier: dict[str, Page] = dataclasses.field(default_factory=dict)
+    figures: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
 
 
 _page = Page([], {})
@@ -160,11 +163,58 @@ def _plain(result: Any) -> dict[str, Any]:
     }
 
 
+# ------------------------------------------------------------------------------------------------------------- drawing
+
+
+def draw(title: str, positions: list[int], answers: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """What a figure of the page shows of these answers, the book's where there is none.
+
+    Args:
+      title: of the figure.
+      positions: where its sliders stand, counted from 0.
+      answers: texts of cells for exercises of the chapter.
+
+    Returns: `values`, those of each series, and `sentence`, "" unless there is nothing to draw: then it says why.
+    """
+    figure, failed = _page.figures[title], dict[str, str]()
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        namespace = _prepared(_page, {**_page.answers, **(answers or {})}, failed)
+        for name in figure["uses"]:
+            if name in failed:
+                return {"values": [], "sentence": f"There is no curve of yours, as the cell of {name} stops: {failed[name]}"}
+        missing.asked_for.clear()
+        try:
+            exec(compile(figure["source"], "<figure>", "exec", dont_inherit=True), namespace)
+            values = figures.values(title, positions)
+        except (Exception, SystemExit) as error:
+            return {"values": [], "sentence": _no_curve(error)}
+    if missing.asked_for:
+        return {"values": [], "sentence": f"There is no curve of yours: {missing.asked_for[0]}."}
+    return {"values": values, "sentence": ""}
+
+
+def _no_curve(error: BaseException) -> str:
+    """Why there is none, and what to do: as course_lib.figures.interactive says it."""
+    if missing.asked_for:
+        return f"There is no curve of yours: {missing.asked_for[0]}."
+    frames = traceback.extract_tb(error.__traceback__)
+    name = next((frame.name for frame in reversed(frames) if frame.filename == "<cell>"), "")
+    if isinstance(error, NotImplementedError) and name:
+        return f"This figure shows what {name} returns, which is not written yet: write it, then draw again."
+    if isinstance(error, NameError) and frames[-1].filename == "<figure>":
+        return f"This figure needs {error.name}, which is not written yet: write it, then draw again."
+    said = f"{type(error).__name__}: {error}"
+    if not name:
+        return f"There is no curve of yours, as the figure can't use what your code returns: {said}."
+    return f"There is no curve of yours, as {name} stops: {said}. Its check says more."
+
+
 # ------------------------------------------------------------------------------------------------------------- running
 
 
-def _prepared(page: Page, answers: Mapping[str, str]) -> dict[str, Any]:
-    """A `__main__` in which the chapter's cells have run, as far as the page can run them, and its exercises are answered."""
+def _prepared(page: Page, answers: Mapping[str, str], failed: dict[str, str] | None = None) -> dict[str, Any]:
+    """A `__main__` in which the chapter's cells have run, as far as the page can run them, and its exercises are answered: by the book
+    where an answer stops, which `failed` is told, with the reason."""
     module = types.ModuleType("__main__")
     sys.modules["__main__"] = module
     namespace = module.__dict__
@@ -177,6 +227,8 @@ def _prepared(page: Page, answers: Mapping[str, str]) -> dict[str, Any]:
     for name, source in answers.items():
         _, stopped = run_cell(source, namespace)
         if stopped or not callable(namespace.get(name)):
+            if failed is not None:
+                failed[name] = stopped or f"The cell defines no function {name}."
             run_cell(page.answers.get(name, ""), namespace)
     return namespace
 
@@ -245,3 +297,4 @@ def earlier(name: str, chapter: int) -> Callable:
 
 _library(HERE / "course_lib")
 elsewhere.install()
+figures.install()

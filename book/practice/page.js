@@ -1,5 +1,6 @@
 // Practice in the page: each exercise's stub that is offered becomes an editor with a check. Without this script the stub stays as it is.
 import {bytes, check, data, script, stop} from "./engine.js";
+import {Mine} from "./figures.js";
 import {Store, read} from "./store.js";
 
 const {version, chapters} = window.coursePractice.index; // the builder writes it before this script
@@ -33,6 +34,12 @@ Object.assign(window.coursePractice, {
     const {state, misconceptions, message} = await check(assignment, name, source);
     return {state, misconceptions, message};
   },
+});
+
+const drafts = () => Object.fromEntries([...answers.keys()].map((name) => [name, store.draft(name)]).filter(([, draft]) => draft !== null));
+const figures = [...document.querySelectorAll("figure.explorer")].flatMap((figure) => {
+  const title = figure.querySelector("figcaption").textContent, uses = chapter?.figures?.[title];
+  return uses ? [new Mine(figure, {assignment, title, uses, drafts, element})] : [];
 });
 
 // ---- an exercise ------------------------------------------------------------------------------------------------------
@@ -90,8 +97,8 @@ function Answer(cell, name) {
     const told = (state) => result.replaceChildren(element("p", {className: "practice-wait"},
       state === "starting" ? "Starting Python, once for this visit: it takes some seconds …" : "Running …"));
     try {
-      const others = [...answers.keys()].filter((other) => other !== name).map((other) => [other, store.draft(other)]);
-      const verdict = await check(assignment, name, text(), Object.fromEntries(others.filter(([, draft]) => draft !== null)), told);
+      const {[name]: _, ...others} = drafts();
+      const verdict = await check(assignment, name, text(), others, told);
       if (verdict.state === "correct") store.pass(name);
       result.replaceChildren(box(name, verdict));
     } catch (error) {
@@ -102,6 +109,7 @@ function Answer(cell, name) {
     tried.disabled = false;
     halt.disabled = true;
     progress();
+    figures.forEach((figure) => figure.again());
   }
 
   code.addEventListener("click", () => { if (!editor && getSelection().isCollapsed) open(true); });
@@ -148,6 +156,7 @@ addEventListener("storage", progress);
 function progress() {
   const done = [...answers.keys()].filter((name) => store.passed(name)).length;
   summary.textContent = `${done} of ${answers.size} passed here. ${keeping()}`;
+  figures.forEach((figure) => figure.update());
   for (const [key, {page, exercises}] of Object.entries(chapters)) {
     const passed = exercises.filter((name) => store.passed(name)).length;
     const here = key === assignment ? ", nav.bd-links li.current.active > a" : "";

@@ -2,7 +2,7 @@
 // It is a classic worker made of a blob, the one kind that both browsers start on a page from disk; Pyodide looks for importScripts
 // to refuse those, and works in them.
 self.importScripts = () => { throw new Error("not here"); };
-let judge;
+let ask;
 
 async function boot({wasm, factory, loader, library, lock, sources, page}) {
   const url = (text) => URL.createObjectURL(new Blob([text], {type: "text/javascript"}));
@@ -20,22 +20,19 @@ async function boot({wasm, factory, loader, library, lock, sources, page}) {
     indexURL: "https://nowhere.invalid/",
   });
   python.unpackArchive(sources, "zip", {extractDir: "/practice"});
-  judge = python.runPython(`
+  ask = python.runPython(`
 import json, sys
 sys.path.insert(0, "/practice")
 import judge
 judge.open_page(${JSON.stringify(page)})
-lambda name, source, answers: json.dumps(judge.check(name, source, json.loads(answers)))
+lambda task, given: json.dumps(getattr(judge, task)(*json.loads(given)))
 `);
 }
 
-const answers = {
-  boot,
-  check: ({name, source, others}) => JSON.parse(judge(name, source, JSON.stringify(others))),
-};
-self.onmessage = async ({data: {id, task, ...given}}) => {
+// "boot", with what boot takes, and then "check" and "draw", with what judge.py's functions of that name take.
+self.onmessage = async ({data: {id, task, given}}) => {
   try {
-    self.postMessage({id, value: (await answers[task](given)) ?? null});
+    self.postMessage({id, value: (await (task === "boot" ? boot(given) : JSON.parse(ask(task, JSON.stringify(given))))) ?? null});
   } catch (error) {
     self.postMessage({id, error: String(error.message ?? error)});
   }

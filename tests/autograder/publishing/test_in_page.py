@@ -10,11 +10,12 @@ import re
 import pytest
 
 from autograder.authoring import chapter as chapters
-from autograder.proving import practice
+from autograder.proving import drawing, practice
 from autograder.publishing import in_page
 
 CHAPTER = chapters.load("ch43")
 NAMES = ["clipped_surrogate_loss"]
+TITLE = "One sample: objectives and gradients against the ratio"
 NOTEBOOKS = {"ch43": b'{"cells": []}'}
 
 
@@ -25,10 +26,11 @@ def ready(tmp_path, monkeypatch):
         (tmp_path / f"{name}.js").write_text(f"// {name}\n", encoding="utf-8")
     monkeypatch.setattr(in_page, "fetched", lambda: tmp_path)
     monkeypatch.setattr(practice, "offered_in", lambda assignment: NAMES)
+    monkeypatch.setattr(drawing, "reasons", lambda chapter, found, outputs: dict.fromkeys((one.title for one in found), ""))
 
 
 def staged(with_solutions: bool = True) -> dict[str, bytes]:
-    return in_page.staged([(CHAPTER, in_page.handed_to(CHAPTER, with_solutions))], NOTEBOOKS)
+    return in_page.staged([(CHAPTER, in_page.handed_to(CHAPTER, [], with_solutions))], NOTEBOOKS)
 
 
 def unpacked(content: bytes) -> bytes:
@@ -47,10 +49,21 @@ def test_each_page_is_given_its_cases_and_its_notebook(ready):
     files = staged()
     told = files["vendor/practice.js"].decode()
     index = json.loads(re.match(r"window\.coursePractice = \{index: (.*)\};\n", told)[1])
-    assert index["chapters"] == {"ch43": {"page": CHAPTER.page, "exercises": NAMES}}
+    assert index["chapters"] == {"ch43": {"page": CHAPTER.page, "exercises": NAMES, "figures": {TITLE: NAMES}}}
     assert list(json.loads(unpacked(files["vendor/practice/ch43.js"]))["page"]["cases"]) == NAMES
     assert unpacked(files["vendor/practice/ch43-notebook.js"]) == NOTEBOOKS["ch43"]
     assert files == staged()
+
+
+def test_a_figure_that_the_page_cannot_draw_is_not_offered_and_a_line_says_so(ready, monkeypatch, capsys):
+    def figures() -> tuple[list, list]:
+        handed = in_page.handed_to(CHAPTER, [], True)
+        return list(handed["figures"]), list(json.loads(handed["text"])["page"]["figures"])
+
+    assert figures() == ([TITLE], [TITLE])
+    monkeypatch.setattr(drawing, "reasons", lambda chapter, found, outputs: {TITLE: "it needs NumPy"})
+    assert figures() == ([], [])
+    assert capsys.readouterr().out == f"ch43: {TITLE!r} is not drawn with the reader's code: it needs NumPy\n"
 
 
 def test_without_solutions_no_answer_is_in_any_file(ready):
