@@ -236,8 +236,8 @@ def _of_one(name: str) -> Callable:
             if input.dtype is dtypes.bool_ and name in _NOT_IMPLEMENTED_OF_TRUTH_VALUES:
                 raise NotImplementedError(f"\"{_NOT_IMPLEMENTED_OF_TRUTH_VALUES[name]}_cpu\" not implemented for 'Bool'")
             compute, slope = _KEEPING_THEIR_KIND[name]
-            kind = dtypes.int64 if input.dtype is dtypes.bool_ and name == "square" else None
-            return entrywise(name, compute, [slope], [input], kind, keeps, chooses=name in _FLAT)
+            counted = dtypes.int64 if input.dtype is dtypes.bool_ and name == "square" else None
+            return entrywise(name, compute, [slope], [input], counted, keeps, chooses=name in _FLAT)
         return entrywise(name, _QUESTIONS[name], None, [input], dtypes.bool_)
 
     function.__name__ = name
