@@ -116,6 +116,19 @@ def misaligned():
     return [_with_batch(changed)]
 
 
+@mistake
+def executed():
+    """The actions stored are those executed, clipped to the engines' bounds, and the log-probabilities are theirs."""
+
+    def changed(batch, settings, policy):
+        actions = batch.actions.clamp(-1, 1)
+        with torch.no_grad():
+            old_log_probs, _, _ = ch45.evaluate_actions(policy, batch.obs, actions)
+        return replace(batch, actions=actions, old_log_probs=old_log_probs)
+
+    return [_with_batch(changed)]
+
+
 def _with_batch(change):
     """A patch of ch45 that changes every batch before it is learned from."""
     estimate = ch45.estimate

@@ -58,6 +58,14 @@ def test_likeliest_actions_take_the_place_of_those_taken():
     assert (broken.old_log_probs >= ours.old_log_probs).all()
 
 
+def test_executed_actions_take_the_place_of_those_sampled():
+    ours, broken = learned_from("ours"), learned_from("broken_executed")
+    assert (ours.actions.abs() > 1).any() and torch.equal(broken.actions, ours.actions.clamp(-1, 1))
+    same = (ours.actions.abs() <= 1).all(-1)
+    torch.testing.assert_close(broken.old_log_probs[same], ours.old_log_probs[same])
+    assert (broken.old_log_probs[~same] != ours.old_log_probs[~same]).all() and torch.equal(broken.advantages, ours.advantages)
+
+
 def test_an_inverted_ratio_turns_the_gradient_around():
     log_probs = np.zeros(3, np.float32)
     _, before = ch45.clipped_surrogate_gradient(log_probs, log_probs, np.ones(3, np.float32), 0.2)
