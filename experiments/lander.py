@@ -129,16 +129,6 @@ def executed():
     return [_with_batch(changed)]
 
 
-@mistake
-def rewards_centred():
-    """The mean reward of each rollout is taken from every step's, which is what normalised targets do to a critic."""
-
-    def compute_gae(rewards, *others):
-        return ch44.compute_gae(rewards - rewards.mean(), *others)
-
-    return [mock.patch.object(ch45, "compute_gae", compute_gae)]
-
-
 def _with_batch(change):
     """A patch of ch45 that changes every batch before it is learned from."""
     estimate = ch45.estimate
