@@ -116,6 +116,29 @@ def misaligned():
     return [_with_batch(changed)]
 
 
+@mistake
+def executed():
+    """The actions stored are those executed, clipped to the engines' bounds, and the log-probabilities are theirs."""
+
+    def changed(batch, settings, policy):
+        actions = batch.actions.clamp(-1, 1)
+        with torch.no_grad():
+            old_log_probs, _, _ = ch45.evaluate_actions(policy, batch.obs, actions)
+        return replace(batch, actions=actions, old_log_probs=old_log_probs)
+
+    return [_with_batch(changed)]
+
+
+@mistake
+def rewards_centred():
+    """The mean reward of each rollout is taken from every step's, which is what normalised targets do to a critic."""
+
+    def compute_gae(rewards, *others):
+        return ch44.compute_gae(rewards - rewards.mean(), *others)
+
+    return [mock.patch.object(ch45, "compute_gae", compute_gae)]
+
+
 def _with_batch(change):
     """A patch of ch45 that changes every batch before it is learned from."""
     estimate = ch45.estimate
@@ -140,7 +163,7 @@ def _configuration(variant: str) -> dict:
 
 
 VARIANTS = {variant: _configuration(variant) for variant in SETTINGS}
-SEEDS = dict.fromkeys(SETTINGS, 5) | {"ours": 20}
+SEEDS = dict.fromkeys(SETTINGS, 5) | {"ours": 20, "broken_rewards_centred": 3}
 
 
 def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result:

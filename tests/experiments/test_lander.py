@@ -47,6 +47,15 @@ def test_returns_are_made_of_normalised_advantages():
     assert torch.equal(broken.advantages, ours.advantages) and not torch.allclose(broken.returns, ours.returns)
 
 
+def test_every_step_pays_the_mean_reward():
+    rewards = torch.tensor([[1.0], [2.0], [6.0]])
+    values, never = torch.zeros(3, 1), torch.zeros(3, 1, dtype=torch.bool)
+    with ExitStack() as patches:
+        for patch in lander.MISTAKES["broken_rewards_centred"]():
+            patches.enter_context(patch)
+        assert ch45.compute_gae(rewards, values, values, never, never, 1.0, 0.0).flatten().tolist() == [-2.0, -1.0, 3.0]
+
+
 def test_advantages_are_misaligned():
     ours, broken = learned_from("ours").advantages, learned_from("broken_misaligned").advantages
     assert torch.equal(broken, ours.view(8, 4).T.flatten()) and not torch.equal(broken, ours)
@@ -56,6 +65,14 @@ def test_likeliest_actions_take_the_place_of_those_taken():
     ours, broken = learned_from("ours"), learned_from("broken_mean_action")
     assert torch.equal(broken.advantages, ours.advantages) and not torch.equal(broken.actions, ours.actions)
     assert (broken.old_log_probs >= ours.old_log_probs).all()
+
+
+def test_executed_actions_take_the_place_of_those_sampled():
+    ours, broken = learned_from("ours"), learned_from("broken_executed")
+    assert (ours.actions.abs() > 1).any() and torch.equal(broken.actions, ours.actions.clamp(-1, 1))
+    same = (ours.actions.abs() <= 1).all(-1)
+    torch.testing.assert_close(broken.old_log_probs[same], ours.old_log_probs[same])
+    assert (broken.old_log_probs[~same] != ours.old_log_probs[~same]).all() and torch.equal(broken.advantages, ours.advantages)
 
 
 def test_an_inverted_ratio_turns_the_gradient_around():
