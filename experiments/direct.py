@@ -1,8 +1,9 @@
 """DPO on human ratings with the tiny language model: weights beta, other losses, an unfrozen reference, a silent bug (chapter 97).
 
 Every variant begins with the fine-tuned policy of the experiment rlhf and learns from some of the comparisons that the reward model there
-has, in one epoch; a run's seed is that of both. A row stands for five steps; in some of them texts of the
-policy as it is then are looked at. At the end it is judged on prompts and on rated texts that it has not seen.
+has, in one epoch; a run's seed is that of both. "own_texts" learns from that policy's own texts instead, as the reward model orders them.
+A row stands for five steps; in some of them texts of the policy as it is then are looked at. At the end it is judged on prompts and on
+rated texts that it has not seen.
 """
 
 from __future__ import annotations
@@ -15,15 +16,17 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.nn.utils.rnn import pad_sequence
 
 from course_lib.language import lm, preferences
 from course_lib.language.direct import Pairs, completion_logps, encode_pairs, like_lengths, reference_logps, train_step
 from course_lib.language.fine_tuning import Writer, Writing, openings
 from course_lib.language.judges import gold_judge
 from course_lib.language.reward_models import RewardModel, fit
-from course_lib.language.rlhf import whole_texts
+from course_lib.language.rlhf import Proxy, whole_texts
 from experiments import rlhf
 from experiments.campaign import Report, Result
+from solutions.ch95 import completion_mask
 from solutions.ch96 import last_token_scores, reward_model_loss
 from solutions.ch97 import dpo_loss, ipo_loss, sequence_logps
 
@@ -37,11 +40,13 @@ VARIANTS: dict[str, dict] = {
     "unfrozen": COMMON | {"loss": "unfrozen", "beta": 1.0},
     "suspect": COMMON | {"padding_counts": True, "look": 10},
     "reward_model": COMMON | {"loss": "reward model"},
+    "own_texts": COMMON | {"candidates": 4, "look": 10},
 }
 SEEDS = 5
 ROWS = 5  # steps that a row stands for
 FEW, MANY = 64, 192  # texts looked at on the way and at the end
 HELD_OUT = 64  # pairs of unseen texts, ordered by raters, that a program would log its accuracy on
+PROMPTS_AT_A_TIME = 32
 RATED = 300  # unseen texts with their mean ratings
 
 
@@ -91,11 +96,16 @@ def encoded(model: lm.LanguageModel, asked: preferences.Preferences) -> Pairs:
 
 
 @functools.cache
-def prepared(count: int, size: int, seed: int, padding_counts: bool) -> tuple[list[Pairs], list[torch.Tensor], float]:
+def prepared(
+    count: int, size: int, seed: int, padding_counts: bool, candidates: int
+) -> tuple[list[Pairs], list[torch.Tensor], float]:
     """One epoch of a seed, the reference's log-probabilities of it, and the processor time that took: once for all variants."""
     model = reference(seed)
+    if candidates:
+        rlhf.reward_model(seed)  # its training is not part of the time
     begun = time.process_time()
-    epoch = batches(encoded(model, comparisons(count, seed)), size, padding_counts, torch.Generator().manual_seed(seed))
+    pairs = own_texts(count, candidates, seed) if candidates else encoded(model, comparisons(count, seed))
+    epoch = batches(pairs, size, padding_counts, torch.Generator().manual_seed(seed))
     return epoch, answered(model, epoch), time.process_time() - begun
 
 
@@ -113,6 +123,31 @@ def rated(seed: int) -> tuple[Pairs, torch.Tensor]:
     snippets, model = preferences.load("test"), reference(seed)
     pairs = encode_pairs(model, snippets.texts[:RATED:2], snippets.texts[1:RATED:2])
     return pairs, reference_logps(model, pairs, sequence_logps)
+
+
+def own_texts(count: int, candidates: int, seed: int) -> Pairs:
+    """Of each prompt's completions by the policy that training begins with, those that chapter 96's reward model likes best and least."""
+    model, proxy = reference(seed), Proxy(rlhf.reward_model(seed), last_token_scores)
+    generator = torch.Generator().manual_seed(40_000 + seed)
+    picked: list[list[torch.Tensor]] = []  # of each text, its own tokens and which of them are the completion's
+    for begin in range(0, count, PROMPTS_AT_A_TIME):
+        prompts = openings("policy")[begin : min(count, begin + PROMPTS_AT_A_TIME)]
+        samples = model.generate(
+            [prompt for prompt in prompts for _ in range(candidates)], rlhf.PPO.new_tokens, generator=generator
+        )
+        scores = proxy(samples).unflatten(0, (-1, candidates))
+        first = torch.arange(len(prompts)) * candidates
+        written = completion_mask(samples.input_ids, samples.prompt_lengths, model.end_id)
+        for row in torch.stack([first + scores.argmax(1), first + scores.argmin(1)], 1).flatten().tolist():
+            kept = samples.attention_mask[row]
+            picked.append([part[row][kept] for part in (samples.input_ids, samples.attention_mask, written)])
+    padding = (model.end_id, False, False)
+    return Pairs(
+        *(
+            pad_sequence(list(part), batch_first=True, padding_value=value).unflatten(0, (-1, 2))
+            for part, value in zip(zip(*picked, strict=True), padding, strict=True)
+        )
+    )
 
 
 @torch.no_grad()
@@ -145,7 +180,7 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
     padding_counts = choice.get("padding_counts", False)
     loss = LOSSES[choice["loss"]](**{key: choice[key] for key in ("beta", "label_smoothing") if key in choice})
     policy = reference(seed).frozen_copy().requires_grad_(True)
-    epoch, ref, seconds = prepared(choice["pairs"], choice["batch"], seed, padding_counts)
+    epoch, ref, seconds = prepared(choice["pairs"], choice["batch"], seed, padding_counts, choice.get("candidates", 0))
     unseen, unseen_ref = held_out(seed, padding_counts)
     optimizer = torch.optim.AdamW(policy.parameters(), lr=choice["learning_rate"], weight_decay=0.0, fused=True)
 

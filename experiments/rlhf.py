@@ -22,7 +22,7 @@ from course_lib.language.rlhf import Proxy, liked_texts, next_token_loss, superv
 from experiments.campaign import Report, Result
 from solutions import ch45, ch95, ch96
 
-PPO = TokenPPO(batch=48, new_tokens=16, minibatch=24, learning_rate=4e-4)
+PPO = TokenPPO(batch=48, new_tokens=16, minibatch=24, learning_rate=4e-4, gae_lambda=0.95)
 COMPARISONS = 4000
 EVALUATION_TEXTS = 256
 CANDIDATES, BEST_OF_N_PROMPTS = 64, 64

@@ -1,4 +1,4 @@
-"""PPO on a language model with VADER's sentiment as reward: weights and forms of the KL penalty, the ratio, the lab (chapter 95).
+"""PPO on a language model with VADER's sentiment as reward: KL penalties, steps, the ratio, the lab (chapter 95).
 
 The policy goes on from the first words of film reviews; what it adds is scored. Every row is one iteration: samples of the policy as
 it was then. At the end, and before, texts to prompts that training has not seen are scored apart.
@@ -18,11 +18,14 @@ from course_lib.language.fine_tuning import Taught, TokenPPO, Writer, Writing, o
 from experiments.campaign import Report, Result
 from solutions import ch45, ch95
 
+HASTY = TokenPPO(gae_lambda=0.95)
 BASE = {"kl_coef": 0.01, "iterations": 24, "learning_rate": 6e-4}
+PATIENT = {"iterations": 50, "learning_rate": 2e-4, "gae_lambda": 1.0}
 VARIANTS: dict[str, dict[str, Any]] = {
     **{f"kl_{kl_coef}": BASE | {"kl_coef": kl_coef} for kl_coef in (0.0, 0.01, 0.05, 0.2)},
     "kl_0.0_long": BASE | {"kl_coef": 0.0, "iterations": 80},
-    "patient": BASE | {"iterations": 50, "learning_rate": 2e-4, "gae_lambda": 1.0},
+    "patient": BASE | PATIENT,
+    **{f"patient_{kl_coef}": BASE | PATIENT | {"kl_coef": kl_coef} for kl_coef in (0.05, 0.2, 0.0)},
     "lab_suspect": BASE | {"rewards": "whitened"},
     "lab_repaired": BASE | {"rewards": "scaled"},
     "per_text": BASE | {"rewards": "penalty averaged over the text", "kl_coef": 1.0},
@@ -67,7 +70,7 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
     configuration: dict[str, Any] = dict(VARIANTS[variant])
     update = UPDATES[configuration.pop("update", "as taught")]
     taught = replace(TAUGHT, kl_penalized_rewards=REWARDS[configuration.pop("rewards", "as taught")])
-    policy, settings = lm.load("tiny"), TokenPPO(**configuration)
+    policy, settings = lm.load("tiny"), HASTY.but(**configuration)
     writer = Writer(policy, policy.frozen_copy(), vader_scores, taught)
     unseen = openings("test")[:EVALUATION_TEXTS]
 

@@ -7,7 +7,10 @@ import torch
 
 from course_lib.language import lm
 from course_lib.language.direct import encode_pairs
+from course_lib.language.fine_tuning import openings
+from course_lib.language.reward_models import RewardModel
 from experiments import direct, rlhf
+from solutions.ch96 import last_token_scores
 
 
 @pytest.fixture(scope="module")
@@ -36,3 +39,20 @@ def test_dpo_learns_from_comparisons_that_the_reward_model_has_too():
     some, everything = direct.comparisons(20, seed=3), direct.preferences.comparisons(rlhf.COMPARISONS, seed=3)
     assert some.chosen_texts == everything.chosen_texts[:20] and some.rejected_texts == everything.rejected_texts[:20]
     assert len(some) == len(some.gap) == 20
+
+
+def test_own_texts_are_what_the_reward_model_likes_best_and_least_of_each_prompts_candidates(monkeypatch):
+    model = lm.load("tiny").frozen_copy()
+    judge = RewardModel(model, seed=0).requires_grad_(False)
+    monkeypatch.setattr(direct, "reference", lambda seed: model)
+    monkeypatch.setattr(rlhf, "reward_model", lambda seed: judge)
+    monkeypatch.setattr(direct, "PROMPTS_AT_A_TIME", 2)
+    pairs = direct.own_texts(count=3, candidates=4, seed=0)
+    input_ids, attention_mask, completion_mask = (part.flatten(0, 1) for part in pairs)
+    scores = last_token_scores(judge(input_ids, attention_mask), attention_mask).unflatten(0, (-1, 2))
+    assert (scores[:, 0] > scores[:, 1]).all()
+    prompts = model.decode(input_ids, attention_mask & ~completion_mask)
+    assert prompts == [prompt for prompt in openings("policy")[:3] for _ in range(2)]
+    assert (completion_mask <= attention_mask).all() and (completion_mask.sum(1) <= rlhf.PPO.new_tokens).all()
+    ended = (input_ids == model.end_id) & completion_mask
+    assert (ended.any(1) | (completion_mask.sum(1) == rlhf.PPO.new_tokens)).all(), "a text that was cut off has no end token"
