@@ -22,7 +22,7 @@ def importance_ratio(log_probs, old_log_probs):
       old_log_probs: the same under the policy that acted, a constant of the rollout; (B,).
 
     Returns: (B,) ratios, dimensionless, positive; 1 where nothing has changed.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     validate.same_shape(log_probs=log_probs, old_log_probs=old_log_probs)
     return (log_probs - old_log_probs.detach()).exp()
@@ -41,7 +41,7 @@ def surrogate_loss(log_probs, old_log_probs, advantages):
       advantages: (B,), in units of reward unless normalised. No gradient.
 
     Returns: scalar (0-dim) tensor.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     validate.same_shape(
         log_probs=log_probs, old_log_probs=old_log_probs, advantages=advantages
@@ -63,7 +63,7 @@ def clipped_surrogate_loss(log_probs, old_log_probs, advantages, clip_range=0.2)
       clip_range: ε ≥ 0, dimensionless; infinity means no clipping.
 
     Returns: scalar (0-dim) tensor.
-    Raises: ValueError if the shapes differ or clip_range < 0.
+    Raises: ValueError that names an argument if the shapes differ or clip_range < 0.
     """
     validate.same_shape(
         log_probs=log_probs, old_log_probs=old_log_probs, advantages=advantages
@@ -89,7 +89,7 @@ def approx_kl(log_probs, old_log_probs):
         (B,).
 
     Returns: scalar (0-dim) tensor in nats, without a graph.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     validate.same_shape(log_probs=log_probs, old_log_probs=old_log_probs)
     log_ratio = (log_probs - old_log_probs).detach()
@@ -110,7 +110,7 @@ def clip_fraction(log_probs, old_log_probs, clip_range=0.2):
       clip_range: ε ≥ 0, dimensionless; infinity means no clipping.
 
     Returns: scalar (0-dim) tensor in [0, 1], in the dtype of log_probs, without a graph.
-    Raises: ValueError if the shapes differ or clip_range < 0.
+    Raises: ValueError that names an argument if the shapes differ or clip_range < 0.
     """
     validate.non_negative(clip_range=clip_range)
     outside = (importance_ratio(log_probs, old_log_probs) - 1).abs() > clip_range
@@ -135,7 +135,8 @@ def repaired_losses(log_probs, advantages, clip_range=0.2):
       clip_range: ε ≥ 0, dimensionless; infinity means no clipping.
 
     Returns: (K,) losses.
-    Raises: ValueError if a row of log_probs and advantages differ in shape, or clip_range < 0.
+    Raises: ValueError that names an argument if a row of log_probs and advantages differ in
+      shape, or clip_range < 0.
     """
     old_log_probs = log_probs[0].detach()
     return torch.stack(

@@ -25,7 +25,8 @@ def td_residuals(rewards, values, next_values, terminated, gamma=0.99):
       gamma: discount per step, in [0, 1].
 
     Returns: (T, N) residuals in units of reward, without a graph.
-    Raises: ValueError if the shapes differ or gamma lies outside [0, 1].
+    Raises: ValueError that names an argument if the shapes differ or gamma lies outside
+      [0, 1].
     """
     validate.same_shape(
         rewards=rewards, values=values, next_values=next_values, terminated=terminated
@@ -56,7 +57,8 @@ def compute_gae(
         minus the value.
 
     Returns: (T, N) advantages in units of reward, without a graph.
-    Raises: ValueError if shapes differ, or gamma or gae_lambda lies outside [0, 1].
+    Raises: ValueError that names an argument if shapes differ, or gamma or gae_lambda lies
+      outside [0, 1].
     """
     validate.same_shape(
         rewards=rewards,
@@ -89,7 +91,7 @@ def lambda_returns(advantages, values):
       values: V(s_t) as used in the estimates; (T, N).
 
     Returns: (T, N) returns in units of reward, without a graph.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     validate.same_shape(advantages=advantages, values=values)
     return (advantages + values).detach()
@@ -125,7 +127,7 @@ def explained_variance(values, returns):
       returns: the targets, in the same shape.
 
     Returns: scalar (0-dim) tensor without a graph; NaN where Var(returns) = 0.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     validate.same_shape(values=values, returns=returns)
     variance = returns.var()
@@ -147,7 +149,8 @@ def repaired_targets(
 
     Returns: (advantages, returns), both (T, N), without a graph: for the policy's loss the
       advantages, normalised over all elements; for the critic's loss its targets.
-    Raises: ValueError if shapes differ, or gamma or gae_lambda lies outside [0, 1].
+    Raises: ValueError that names an argument if shapes differ, or gamma or gae_lambda lies
+      outside [0, 1].
     """
     advantages = compute_gae(
         rewards, values, next_values, terminated, truncated, gamma, gae_lambda

@@ -40,8 +40,8 @@ def gaussian_log_prob(mean, log_std, actions):
       actions: as sampled, before clipping to the bounds; (B, A).
 
     Returns: (B,) nats, summed over the components.
-    Raises: ValueError if the shapes of mean and actions differ, or log_std is neither (A,)
-      nor (B, A).
+    Raises: ValueError that names an argument if the shapes of mean and actions differ, or
+      log_std is neither (A,) nor (B, A).
     """
     validate.same_shape(mean=mean, actions=actions)
     validate.same_shape(
@@ -103,7 +103,8 @@ def collect_rollout(envs, policy, num_steps, obs, generator):
     Returns: Rollout of (T, N) steps, float32; `next_obs` is the true successor of each
       step, also where an episode ends; `last_obs` is what the environments show
       afterwards.
-    Raises: ValueError if envs resets in another way than in the same step.
+    Raises: ValueError that names an argument if envs resets in another way than in the same
+      step.
     """
     require_same_step_autoreset(envs)
     bounds = envs.single_action_space
@@ -139,7 +140,7 @@ def minibatches(batch_size, minibatch_size, generator):
       generator: torch generator, the only source of the order.
 
     Returns: iterator of int64 index tensors.
-    Raises: ValueError if batch_size or minibatch_size is less than 1.
+    Raises: ValueError that names an argument if batch_size or minibatch_size is less than 1.
     """
     for name, value in (("batch_size", batch_size), ("minibatch_size", minibatch_size)):
         if value < 1:
@@ -177,8 +178,8 @@ def ppo_loss(
 
     Returns: (scalar loss, metrics), where metrics holds policy_loss, value_loss, entropy,
       approx_kl and clip_fraction, and nothing else, as 0-dim tensors without a graph.
-    Raises: ValueError if the shapes of all but entropy differ, entropy is neither (B,) nor
-      (), or clip_range < 0.
+    Raises: ValueError that names an argument if the shapes of all but entropy differ, entropy
+      is neither (B,) nor (), or clip_range < 0.
     """
     validate.same_shape(
         log_probs=log_probs,

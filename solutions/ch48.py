@@ -30,7 +30,7 @@ def squashed_gaussian_log_prob(mean, log_std, pre_tanh_actions):
         μ + σ ε, and the policy learns through it.
 
     Returns: (B,) nats, summed over the components.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     validate.same_shape(mean=mean, log_std=log_std, pre_tanh_actions=pre_tanh_actions)
     scaled = (pre_tanh_actions - mean) * (-log_std).exp()
@@ -61,7 +61,7 @@ def soft_q_target(rewards, terminated, next_q1, next_q2, next_log_probs, alpha, 
       gamma: γ, in [0, 1].
 
     Returns: (B,), without a graph.
-    Raises: ValueError if the shapes differ or gamma is outside [0, 1].
+    Raises: ValueError that names an argument if the shapes differ or gamma is outside [0, 1].
     """
     validate.same_shape(
         rewards=rewards,
@@ -91,7 +91,7 @@ def sac_actor_loss(q1, q2, log_probs, alpha):
         tensor. No gradient.
 
     Returns: scalar tensor.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     validate.same_shape(q1=q1, q2=q2, log_probs=log_probs)
     alpha = torch.as_tensor(alpha).detach()
@@ -129,8 +129,8 @@ def polyak_update(target_params, online_params, tau):
       tau: τ in [0, 1]: 0 leaves the targets where they are, 1 copies.
 
     Returns: None. No graph is made.
-    Raises: ValueError if a tensor's shape differs from its partner's, or tau is outside
-      [0, 1].
+    Raises: ValueError that names an argument if a tensor's shape differs from its partner's,
+      or tau is outside [0, 1].
     """
     validate.unit_interval(tau=tau)
     with torch.no_grad():
@@ -205,7 +205,8 @@ def repaired_transitions(obs, sent, rewards, next_obs, terminated, truncated, lo
       low, high: the bounds of what the environment takes, low < high; (A,).
 
     Returns: Transitions of N steps, as the update of SAC needs them.
-    Raises: ValueError if the numbers of rows differ, or low < high does not hold everywhere.
+    Raises: ValueError that names an argument if the numbers of rows differ, or low < high does
+      not hold everywhere.
     """
     for name, rows in {
         "sent": sent,

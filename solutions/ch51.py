@@ -28,8 +28,8 @@ def gaussian_nll(mean, log_var, targets):
         (B, D) for all of them. No gradient.
 
     Returns: scalar tensor, in nats.
-    Raises: ValueError if the shapes of mean and log_var differ, or that of targets is
-      neither theirs nor theirs without the first axis.
+    Raises: ValueError that names an argument if the shapes of mean and log_var differ, or that
+      of targets is neither theirs nor theirs without the first axis.
     """
     validate.same_shape(mean=mean, log_var=log_var)
     targets = targets.detach()
@@ -103,7 +103,8 @@ def dreamer_lambda_returns(rewards, values, continues, gamma, lam):
       lam: λ, in [0, 1].
 
     Returns: (H, B), in units of reward.
-    Raises: ValueError if the shapes differ, or gamma or lam is outside [0, 1].
+    Raises: ValueError that names an argument if the shapes differ, or gamma or lam is outside
+      [0, 1].
     """
     validate.same_shape(rewards=rewards, values=values, continues=continues)
     validate.unit_interval(gamma=gamma, lam=lam)
@@ -131,7 +132,8 @@ def model_error_by_horizon(model, obs, actions, generator):
       generator: torch generator, handed to the model, which is called once for each step.
 
     Returns: (H,), for h = 1 to H, in units of the observations, without a graph.
-    Raises: ValueError if obs is not one step longer than actions, or their batches differ.
+    Raises: ValueError that names an argument if obs is not one step longer than actions, or
+      their batches differ.
     """
     if len(obs) != len(actions) + 1 or obs.shape[1] != actions.shape[1]:
         raise ValueError(
@@ -162,7 +164,7 @@ def repaired_next_obs(network, obs, actions, seen):
         and no component is constant.
 
     Returns: next_obs, (B, O), in units of observations. B may be 1.
-    Raises: ValueError if obs and actions have different batches.
+    Raises: ValueError that names an argument if obs and actions have different batches.
     """
     if len(obs) != len(actions):
         raise ValueError(

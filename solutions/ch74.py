@@ -26,7 +26,7 @@ def collect_demonstrations(policy, env, num_episodes, seed):
     Returns: Demonstrations of M steps without a graph: obs (M, O) float32, before each
       action; actions (M, A) float32 or (M,) int64, as the policy returned them;
       episode_ids (M,) int64 from 0; returns (E,) float32, undiscounted.
-    Raises: ValueError if num_episodes < 1.
+    Raises: ValueError that names an argument if num_episodes < 1.
     """
     validate.at_least_one(num_episodes=num_episodes)
     obs_rows, action_rows, episode_ids, returns = [], [], [], []
@@ -66,8 +66,8 @@ def split_by_episode(episode_ids, fraction, generator):
       generator: torch.Generator, the only source of randomness.
 
     Returns: (train, held_out), two complementary (M,) bool masks.
-    Raises: ValueError if fraction lies outside [0, 1], or episode_ids has fewer than two
-      episodes.
+    Raises: ValueError that names an argument if fraction lies outside [0, 1], or episode_ids
+      has fewer than two episodes.
     """
     validate.unit_interval(fraction=fraction)
     episodes = episode_ids.unique()
@@ -95,7 +95,8 @@ def behavioural_cloning_loss(logits, expert_actions):
       expert_actions: a*, the index of what the expert did; (B,) int64.
 
     Returns: scalar (0-dim) tensor, in nats.
-    Raises: ValueError if logits is not (B, A) or expert_actions not (B,).
+    Raises: ValueError that names an argument if logits is not (B, A) or expert_actions not
+      (B,).
     """
     if logits.ndim != 2 or expert_actions.shape != logits.shape[:1]:
         raise ValueError(
@@ -119,8 +120,8 @@ def gaussian_cloning_loss(mean, log_std, expert_actions):
       expert_actions: a*, what the expert did; (B, A). No gradient.
 
     Returns: scalar (0-dim) tensor, in nats.
-    Raises: ValueError if mean and expert_actions differ in shape, or log_std is neither
-      (A,) nor (B, A).
+    Raises: ValueError that names an argument if mean and expert_actions differ in shape, or
+      log_std is neither (A,) nor (B, A).
     """
     validate.same_shape(mean=mean, expert_actions=expert_actions)
     if log_std.shape not in (mean.shape, mean.shape[-1:]):
@@ -160,8 +161,8 @@ def train_bc(
       generator: torch.Generator for the minibatches, or None for PyTorch's own.
 
     Returns: (num_steps,) tensor without a graph: each minibatch's loss before its step.
-    Raises: ValueError if obs and actions differ in their number of rows, or
-      num_steps < 1.
+    Raises: ValueError that names an argument if obs and actions differ in their number of
+      rows, or num_steps < 1.
     """
     validate.at_least_one(num_steps=num_steps)
     validate.same_length(obs=obs, actions=actions)
@@ -189,7 +190,7 @@ def evaluate(policy, env, num_episodes, seed):
       seed: of the first episode; policies evaluated with one seed meet the same starts.
 
     Returns: (E,) float32 undiscounted returns, without a graph.
-    Raises: ValueError if num_episodes < 1.
+    Raises: ValueError that names an argument if num_episodes < 1.
     """
     return collect_demonstrations(policy, env, num_episodes, seed).returns
 
@@ -209,7 +210,7 @@ def state_shift(expert_obs, agent_obs):
       agent_obs: (M, O).
 
     Returns: scalar (0-dim) tensor, at least 0 (up to rounding); 0 for equal samples.
-    Raises: ValueError if the two are not matrices of one width.
+    Raises: ValueError that names an argument if the two are not matrices of one width.
     """
     if (
         expert_obs.ndim != 2
@@ -245,7 +246,7 @@ def repaired_pairs(obs, actions, episode_ids):
 
     Returns: (obs, actions), (K, O) and (K, A): row by row what the driver saw and what it
       did then, for all steps of which the log holds both, in their order.
-    Raises: ValueError if the three differ in their number of rows.
+    Raises: ValueError that names an argument if the three differ in their number of rows.
     """
     validate.same_length(obs=obs, actions=actions, episode_ids=episode_ids)
     same_episode = episode_ids[1:] == episode_ids[:-1]

@@ -23,7 +23,7 @@ def segment_returns(rewards, mask):
       mask: (B, T) bool, True on steps that belong to the segment. Padding counts for nothing.
 
     Returns: (B,) returns, in units of reward.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     validate.same_shape(rewards=rewards, mask=mask)
     return rewards.masked_fill(~mask, 0).sum(dim=-1)
@@ -43,7 +43,7 @@ def preference_probability(returns_a, returns_b):
       returns_b: (B,), likewise. Receives gradient.
 
     Returns: (B,) probabilities, finite for returns of any size.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     validate.same_shape(returns_a=returns_a, returns_b=returns_b)
     return torch.sigmoid(returns_a - returns_b)
@@ -61,7 +61,7 @@ def simulate_preferences(true_returns_a, true_returns_b, temperature, generator)
       generator: torch.Generator, the only source of randomness.
 
     Returns: (B,) bool, True where a is preferred.
-    Raises: ValueError if the shapes differ or temperature <= 0.
+    Raises: ValueError that names an argument if the shapes differ or temperature <= 0.
     """
     validate.same_shape(true_returns_a=true_returns_a, true_returns_b=true_returns_b)
     validate.positive(temperature=temperature)
@@ -86,7 +86,7 @@ def bradley_terry_loss(chosen_returns, rejected_returns):
 
     Returns: scalar (0-dim) tensor in nats, finite and with the right gradient for gaps of any
       size; log 2 where the model cannot tell the segments of any pair apart.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     validate.same_shape(chosen_returns=chosen_returns, rejected_returns=rejected_returns)
     return -F.logsigmoid(chosen_returns - rejected_returns).mean()
@@ -102,7 +102,7 @@ def preference_accuracy(chosen_returns, rejected_returns):
       rejected_returns: of the other segment of each pair; (B,).
 
     Returns: scalar (0-dim) tensor in [0, 1], in the dtype of chosen_returns, without a graph.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     validate.same_shape(chosen_returns=chosen_returns, rejected_returns=rejected_returns)
     return (chosen_returns > rejected_returns).to(chosen_returns.dtype).mean()
@@ -122,7 +122,7 @@ def standardize_rewards(rewards, mask, eps=1e-8):
       eps: added to the standard deviation, in units of reward.
 
     Returns: (B, T), dimensionless, 0 where the mask is False.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     validate.same_shape(rewards=rewards, mask=mask)
     kept = rewards[mask]
@@ -138,7 +138,8 @@ def repaired_segment_returns(reward_model, obs, mask):
       mask: (B, T) bool, True on steps that belong to the segment.
 
     Returns: (B,) returns, in the reward model's unit, whatever numbers stand in the padding.
-    Raises: ValueError if the leading shapes (B, T) of obs and mask differ.
+    Raises: ValueError that names an argument if the leading shapes (B, T) of obs and mask
+      differ.
     """
     if obs.shape[:-1] != mask.shape:
         raise ValueError(

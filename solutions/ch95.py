@@ -21,7 +21,7 @@ def per_token_logps(logits, input_ids):
       input_ids: the tokens; (B, L) int64.
 
     Returns: (B, L - 1) log-probabilities in nats, of input_ids[:, 1:].
-    Raises: ValueError if batch or length differ.
+    Raises: ValueError that names an argument if batch or length differ.
     """
     validate.same_shape(logits=logits[..., 0], input_ids=input_ids)
     return logits[:, :-1].log_softmax(-1).gather(-1, input_ids[:, 1:, None]).squeeze(-1)
@@ -43,7 +43,7 @@ def completion_mask(input_ids, prompt_lengths, eos_token_id):
 
     Returns: (B, L) bool, True from column prompt_lengths[b] up to and including the
       first end token at or after it, or up to the last column if there is none.
-    Raises: ValueError if the batch sizes differ.
+    Raises: ValueError that names an argument if the batch sizes differ.
     """
     validate.same_shape(prompt_lengths=prompt_lengths, input_ids=input_ids[:, 0])
     columns = torch.arange(input_ids.shape[1], device=input_ids.device)
@@ -70,7 +70,7 @@ def kl_penalized_rewards(scores, logps, ref_logps, mask, kl_coef):
       kl_coef: β, in units of score per nat.
 
     Returns: (B, L') rewards without a graph, 0 where the mask is False.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     validate.same_shape(logps=logps, ref_logps=ref_logps, mask=mask)
     validate.same_shape(scores=scores, logps=logps[:, 0])
@@ -94,7 +94,7 @@ def masked_mean(x, mask):
       mask: True = keep; (B, L') bool.
 
     Returns: scalar (0-dim) tensor.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     validate.same_shape(x=x, mask=mask)
     return x[mask].mean()
@@ -111,7 +111,7 @@ def masked_whiten(x, mask, eps=1e-8):
       eps: ε ≥ 0, keeps constant entries from dividing by 0.
 
     Returns: (B, L'), 0 where the mask is False.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     mean = masked_mean(x, mask)
     variance = masked_mean((x - mean) ** 2, mask)
@@ -134,7 +134,8 @@ def masked_gae(rewards, values, mask, gamma, gae_lambda):
       gae_lambda: λ in [0, 1].
 
     Returns: (B, L') advantages without a graph, 0 where the mask is False.
-    Raises: ValueError if shapes differ, or gamma or gae_lambda lies outside [0, 1].
+    Raises: ValueError that names an argument if shapes differ, or gamma or gae_lambda lies
+      outside [0, 1].
     """
     validate.same_shape(rewards=rewards, values=values, mask=mask)
     validate.unit_interval(gamma=gamma, gae_lambda=gae_lambda)
@@ -167,7 +168,7 @@ def ppo_token_loss(logps, old_logps, advantages, mask, clip_range=0.2):
       clip_range: ε ≥ 0, dimensionless; infinity means no clipping.
 
     Returns: scalar (0-dim) tensor, the mean over all kept tokens, not of row means.
-    Raises: ValueError if the shapes differ or clip_range < 0.
+    Raises: ValueError that names an argument if the shapes differ or clip_range < 0.
     """
     validate.same_shape(logps=logps, old_logps=old_logps, advantages=advantages, mask=mask)
     validate.non_negative(clip_range=clip_range)
@@ -192,7 +193,7 @@ def repaired_reward_scaling(rewards, mask, eps=1e-8):
       eps: ε ≥ 0, added to the variance.
 
     Returns: (B, L') dimensionless rewards, 0 where the mask is False.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     variance = masked_mean((rewards - masked_mean(rewards, mask)) ** 2, mask)
     return torch.where(mask, rewards / (variance + eps).sqrt(), 0)

@@ -26,7 +26,7 @@ def last_token_scores(values, attention_mask):
         either side; at least one token in each row; (B, L) bool or int64.
 
     Returns: (B,) scores.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     validate.same_shape(values=values, attention_mask=attention_mask)
     columns = torch.arange(values.shape[1], device=values.device)
@@ -48,7 +48,7 @@ def reward_model_loss(chosen_scores, rejected_scores, margin=None):
         no margin. No gradient.
 
     Returns: scalar (0-dim) tensor, finite for any finite scores.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     validate.same_shape(chosen_scores=chosen_scores, rejected_scores=rejected_scores)
     gaps = chosen_scores - rejected_scores
@@ -83,7 +83,7 @@ def best_of_n_kl(n):
       n: number of candidates, at least 1.
 
     Returns: float, in nats.
-    Raises: ValueError if n < 1.
+    Raises: ValueError that names an argument if n < 1.
     """
     if n < 1:
         raise ValueError(f"n must be at least 1, got {n}")
@@ -102,7 +102,7 @@ def length_correlation(scores, lengths):
       lengths: of the same texts, in tokens, not all equal; (B,) int64 or floating point.
 
     Returns: scalar (0-dim) tensor in [-1, 1], in the dtype of scores, without a graph.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     validate.same_shape(scores=scores, lengths=lengths)
     a = scores.detach() - scores.detach().mean()
@@ -124,7 +124,7 @@ def repaired_choices(first, second, first_ratings, second_ratings):
 
     Returns: chosen, rejected: indices of texts, in the order of the pairs without those
       that are left out; two tensors of one length, int64.
-    Raises: ValueError if the shapes differ.
+    Raises: ValueError that names an argument if the shapes differ.
     """
     validate.same_shape(
         first=first, second=second, first_ratings=first_ratings, second_ratings=second_ratings

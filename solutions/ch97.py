@@ -23,7 +23,7 @@ def sequence_logps(logits, input_ids, completion_mask):
         is predicted by nothing and never counts; (B, L) bool.
 
     Returns: (B,) log-probabilities in nats.
-    Raises: ValueError if batch or length differ.
+    Raises: ValueError that names an argument if batch or length differ.
     """
     validate.same_shape(
         logits=logits[..., 0], input_ids=input_ids, completion_mask=completion_mask
@@ -59,8 +59,8 @@ def dpo_loss(
 
     Returns: losses, chosen_rewards, rejected_rewards; (B,) each. The implicit rewards,
       β (log π - log π_ref), carry no graph.
-    Raises: ValueError if the shapes differ, beta ≤ 0, or label_smoothing is outside
-      [0, 0.5).
+    Raises: ValueError that names an argument if the shapes differ, beta ≤ 0, or
+      label_smoothing is outside [0, 0.5).
     """
     validate.same_shape(
         chosen_logps=chosen_logps,
@@ -95,7 +95,7 @@ def ipo_loss(chosen_logps, rejected_logps, ref_chosen_logps, ref_rejected_logps,
       beta: β > 0; the larger, the smaller the margin aimed at.
 
     Returns: (B,) losses, in nats squared.
-    Raises: ValueError if the shapes differ or beta ≤ 0.
+    Raises: ValueError that names an argument if the shapes differ or beta ≤ 0.
     """
     validate.same_shape(
         chosen_logps=chosen_logps,
@@ -124,7 +124,7 @@ def kl_optimal_policy(ref_probs, rewards, beta):
       beta: β > 0, in units of reward per nat.
 
     Returns: (..., Y) probabilities, sum to 1 over the last axis.
-    Raises: ValueError if the shapes differ or beta ≤ 0.
+    Raises: ValueError that names an argument if the shapes differ or beta ≤ 0.
     """
     validate.same_shape(ref_probs=ref_probs, rewards=rewards)
     validate.positive(beta=beta)
@@ -140,7 +140,7 @@ def repaired_completion_mask(attention_mask, prompt_tokens):
       prompt_tokens: how many of a text's own tokens are its prompt; (B,) int64.
 
     Returns: (B, L) bool, True at the tokens that the policy would have to write.
-    Raises: ValueError if the numbers of rows differ.
+    Raises: ValueError that names an argument if the numbers of rows differ.
     """
     validate.same_length(attention_mask=attention_mask, prompt_tokens=prompt_tokens)
     return attention_mask & (attention_mask.cumsum(1) > prompt_tokens[:, None])
