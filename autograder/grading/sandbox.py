@@ -396,13 +396,16 @@ socket.socket(fileno=int(sys.argv[1])).sendall(len(frame).to_bytes(8, "big") + f
 """
 
 
-def probe(torch: bool = False) -> list[Problem]:
-    """What keeps a real sandbox from working here: nothing, if the list is empty. `torch` also imports torch inside (seconds)."""
+def probe(torch: bool = False, server: ForkServer | None = None) -> list[Problem]:
+    """What keeps a real sandbox, or one that `server` forks, from working here: nothing, if the list is empty.
+
+    `torch` also imports torch inside (seconds).
+    """
     with tempfile.TemporaryDirectory() as folder:
         script = Path(folder, "probe.py")
         script.write_text(PROBE.format(torch=torch))
         try:
-            with Sandbox(script) as sandbox:
+            with Sandbox(script, server=server) as sandbox:
                 answer = sandbox.receive(timeout=START_TIMEOUT).decode()
         except SandboxUnavailable as error:
             return [Problem("no sandbox", str(error))]
