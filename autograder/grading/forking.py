@@ -38,6 +38,7 @@ PRELOADED = (
     "course_lib.checks.stored",
 )
 START_TIMEOUT = 120.0  # seconds until torch is loaded, on a busy machine
+ANSWER_TIMEOUT = 10.0  # seconds until a server that is ready has forked; they are a submission's own
 
 
 class Refused(Exception):
@@ -73,6 +74,7 @@ class ForkServer:
             )  # fmt: skip
         except (OSError, NotImplementedError) as error:
             self._socket.close()
+            self._complaints.close()
             raise Refused(f"no server: {error}") from error
         finally:
             theirs.close()
@@ -88,14 +90,17 @@ class ForkServer:
             self._socket.settimeout(START_TIMEOUT)
             try:
                 self._ready = self._socket.recv(1) == b"+"
+                self._socket.settimeout(ANSWER_TIMEOUT)
             except OSError as error:
+                self.close()
                 raise Refused(f"the server did not start: {error}") from error
             if not self._ready:
                 raise Refused(f"the server did not start: {self._complaint()}")
 
     def _complaint(self) -> str:
-        self.close()
-        return self._complaints.read(4000).decode(errors="replace").strip() or "it said nothing"
+        self.close(keep_complaints=True)
+        with self._complaints:
+            return self._complaints.read(4000).decode(errors="replace").strip() or "it said nothing"
 
     def fork(self, channel: int, complaints: int, request: dict[str, Any], handed: Sequence[int]) -> Leash:
         """A new process that runs a script.
@@ -116,9 +121,11 @@ class ForkServer:
             ours.close()
             raise Refused(f"the server does not answer: {error}") from error
 
-    def close(self) -> None:
-        """End the server and all that it has forked."""
+    def close(self, keep_complaints: bool = False) -> None:
+        """End the server. What it has forked ends with its sandbox."""
         self._socket.close()
+        if not keep_complaints:
+            self._complaints.close()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout=2)
         self._process.kill()
@@ -168,7 +175,7 @@ class Leash:
     def __init__(self, end: socket.socket, request: dict[str, Any], handed: Sequence[int]) -> None:
         self._end = end
         self._status: int | None = None
-        end.settimeout(START_TIMEOUT)
+        end.settimeout(ANSWER_TIMEOUT)
         word, credentials, _, _ = end.recvmsg(1, socket.CMSG_SPACE(struct.calcsize("3i")))
         if not (word and credentials):
             raise OSError("it has ended")
@@ -176,7 +183,7 @@ class Leash:
         self.root = psutil.Process(struct.unpack("3i", credentials[0][2])[0])
         text = json.dumps(request).encode()
         end.sendall(len(text).to_bytes(8, "big"))
-        socket.send_fds(end, [text], handed)
+        end.sendall(text[socket.send_fds(end, [text], handed) :])
         end.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 0)
 
     def wait(self, timeout: float | None = None) -> int:
@@ -191,9 +198,14 @@ class Leash:
         return self._status
 
     def kill(self) -> None:
-        """Let go."""
+        """Let go, and see that it is noticed."""
         with suppress(OSError):
             self._end.shutdown(socket.SHUT_WR)
+        try:
+            self.wait(timeout=2)
+        except subprocess.TimeoutExpired:
+            with suppress(psutil.Error):
+                self.root.kill()
 
     def close(self) -> None:
         self._end.close()

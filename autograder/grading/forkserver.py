@@ -7,8 +7,9 @@ three descriptors: the script's channel, a leash, and a pipe for complaints. Of 
 
   the keeper   stays outside the new namespaces of processes: it holds the leash, kills what it leads to when the judge lets go, and
                says how that ended (one byte, as a shell would put it);
-  the first    is process 1 of the namespaces: it makes the file system, drops every privilege, and then only reaps;
-  the script   has limits, a filter of system calls and the channel, and nothing else.
+  the first    is process 1 of the namespaces: it makes the file system, drops every privilege, takes the limits and the filter of
+               system calls, for the script can write into its memory, and then only reaps;
+  the script   has the channel, and nothing else.
 
 Each privilege is given up before the script starts, in the order in which giving up needs them. Whoever changes a line here, look at
 what bubblewrap does at that place (https://github.com/containers/bubblewrap), and run tests/autograder/grading/test_sandbox.py.
@@ -28,6 +29,7 @@ import signal
 import socket
 import struct
 import sys
+from contextlib import suppress
 from typing import Any, NoReturn
 
 CLONE_NEWNS, CLONE_NEWUTS, CLONE_NEWIPC, CLONE_NEWUSER, CLONE_NEWPID, CLONE_NEWNET = (
@@ -63,10 +65,11 @@ def main() -> NoReturn:
         word, descriptors, _, _ = socket.recv_fds(judge, 1, 3)
         if not word:
             os._exit(0)
-        if os.fork() == 0:
-            judge.close()
-            channel, leash, complaints = descriptors
-            keep(channel, leash, complaints, path)
+        with suppress(OSError):  # no process to be had is one request's trouble, and what runs goes on
+            if len(descriptors) == 3 and os.fork() == 0:
+                judge.close()
+                channel, leash, complaints = descriptors
+                keep(channel, leash, complaints, path)
         for descriptor in descriptors:
             os.close(descriptor)
 
@@ -94,14 +97,16 @@ def keep(channel: int, leash_number: int, complaints: int, path: list[str]) -> N
         leash = socket.socket(fileno=leash_number)
         leash.sendall(b"k")  # the kernel adds who says so, which is how the judge learns of this process
         size = int.from_bytes(leash.recv(8, socket.MSG_WAITALL), "big")
-        text, handed, _, _ = socket.recv_fds(leash, size, MOST_FILES, socket.MSG_WAITALL)
+        text, handed, _, _ = socket.recv_fds(leash, size, MOST_FILES)
+        while len(text) < size and (more := leash.recv(size - len(text))):  # each reading ends with what descriptors came with
+            text += more
+        handle = os.pidfd_open(os.getpid())
         unshare(CLONE_NEWUSER | CLONE_NEWNS | CLONE_NEWPID | CLONE_NEWIPC | CLONE_NEWNET | CLONE_NEWUTS)
         first = os.fork()
         if first == 0:
             leash.close()
-            be_first(channel, json.loads(text), handed, path)
-        os.close(channel)
-        for descriptor in handed:
+            be_first(channel, handle, json.loads(text), handed, path)
+        for descriptor in (channel, handle, *handed):
             os.close(descriptor)
         os.dup2(os.open(os.devnull, os.O_RDWR), 2)  # or complaints would stay open as long as the script runs
         handle = os.pidfd_open(first)
@@ -109,8 +114,8 @@ def keep(channel: int, leash_number: int, complaints: int, path: list[str]) -> N
             os.kill(first, signal.SIGKILL)
         status = shells(os.waitpid(first, 0)[1])
         leash.send(bytes([status]))
-    except OSError:
-        pass
+    except BaseException as error:
+        complain(error)
     finally:
         os._exit(status)
 
@@ -132,19 +137,28 @@ def shells(status: int) -> int:
 # ---- the first process of the namespaces ----------------------------------------------------------------------------
 
 
-def be_first(channel: int, given: dict[str, Any], handed: list[int], path: list[str]) -> NoReturn:
+def be_first(channel: int, keeper: int, given: dict[str, Any], handed: list[int], path: list[str]) -> NoReturn:
     """Make the file system and the network, give up everything, fork the script, and reap."""
     status = 1
     try:
         call(libc.prctl, PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+        if select.select([keeper], [], [], 0)[0]:
+            raise ChildProcessError("the keeper died before its end could be a signal")
+        os.close(keeper)
         os.setsid()
-        file_system(given["sizes"], given["files"], handed[1:])
+        with os.fdopen(handed[0], "rb") as file:
+            source = file.read()
+        file_system(given["sizes"], given["files"], handed[1:])  # after which no descriptor of the host's files is left
         loopback()
         write("/proc/sys/user/max_user_namespaces", "0")
         drop_privileges()
+        for name, value in given["limits"].items():
+            resource.setrlimit(getattr(resource, name), (value, value))
+        write("/proc/self/oom_score_adj", "1000")
+        refuse_calls(bytes.fromhex(given["filter"]))
         script = os.fork()
         if script == 0:
-            be_script(channel, given, handed[0], path)
+            be_script(channel, given["name"], source, path)
         silence()
         os.closerange(3, 1 << 16)
         while True:
@@ -173,6 +187,7 @@ def file_system(sizes: dict[str, int], names: list[str], descriptors: list[int])
         while sent := os.sendfile(copy, descriptor, place, 1 << 24):
             place += sent
         os.close(copy)
+        os.close(descriptor)
     os.chdir("/work")
 
 
@@ -200,19 +215,16 @@ def no_capabilities() -> None:
 # ---- the script -----------------------------------------------------------------------------------------------------
 
 
-def be_script(channel: int, given: dict[str, Any], source: int, path: list[str]) -> NoReturn:
-    """Set the limits and the filter, tell the judge that all that is ours has worked, and run the script."""
-    with os.fdopen(source, "rb") as file:
-        code = compile(file.read(), given["name"], "exec", dont_inherit=True)
-    for name, value in given["limits"].items():
-        resource.setrlimit(getattr(resource, name), (value, value))
-    write("/proc/self/oom_score_adj", "1000")
-    refuse_calls(bytes.fromhex(given["filter"]))
+def be_script(channel: int, name: str, source: bytes, path: list[str]) -> NoReturn:
+    """Tell the judge that all that is ours has worked, and run the script."""
+    code = compile(source, name, "exec", dont_inherit=True)
+    if numpys := sys.modules.get("numpy.random"):
+        numpys.seed()  # others see to that themselves when a process is forked
     sys.path.append(path[-1])
-    sys.argv = [given["name"], str(channel)]
+    sys.argv = [name, str(channel)]
     module = type(sys)("__main__")
     sys.modules["__main__"] = module
-    module.__file__ = given["name"]
+    module.__file__ = name
     silence()
     os.closerange(3, channel)
     os.closerange(channel + 1, 1 << 16)

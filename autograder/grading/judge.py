@@ -323,9 +323,9 @@ class _Run:
             try:
                 return stack.enter_context(Sandbox(WORKER, [COURSE_LIB], files, server=server))
             except SandboxUnavailable as error:
-                problem = str(error)
+                problem, unasked = str(error), isinstance(error.__cause__, forking.Refused)  # before it heard of the submission
         sandbox = stack.enter_context(Sandbox(WORKER, [COURSE_LIB], files, trusted=self._trusted))
-        if server is not None and not files:
+        if server is not None and (unasked or not files):
             forking.course.give_up(problem)
         return sandbox
 

@@ -334,6 +334,8 @@ class Sandbox:
                     self._process.wait(timeout=2)
             self._process.kill()
             self._process.wait()
+            if isinstance(self._process, Leash):
+                self._process.close()
             if not self.trusted:
                 psutil.wait_procs(tree[:1], timeout=5)
             self._process = self._root = None

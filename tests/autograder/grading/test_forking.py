@@ -1,16 +1,19 @@
 """Scripts that one server forks find nothing of one another: attacks in pairs, where the first leaves something for the second to find."""
 
 import json
+import os
+import subprocess
+import sys
 import textwrap
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 
 import psutil
 import pytest
 
 from autograder.grading import forking, judge, sandbox
 from autograder.grading.forking import ForkServer, Refused
-from autograder.grading.sandbox import Sandbox, SandboxDied
-from autograder.paths import COURSE_LIB
+from autograder.grading.sandbox import Sandbox, SandboxDied, SandboxUnavailable
+from autograder.paths import COURSE_LIB, ROOT
 
 PRELUDE = """
 import ctypes, errno, json, os, signal, socket, sys, time
@@ -171,8 +174,9 @@ def test_the_servers_memory_holds_nothing_of_a_submission(enter, tmp_path):
 
 def test_each_has_randomness_of_its_own(enter):
     code = """
-        import random, secrets, tempfile, uuid
-        say([random.random(), secrets.token_hex(), str(uuid.uuid4()), tempfile.mktemp()])
+        import numpy, random, secrets, tempfile, uuid
+        numbers = [random.random(), numpy.random.random(), numpy.random.default_rng().random()]
+        say([*numbers, secrets.token_hex(), str(uuid.uuid4()), tempfile.mktemp()])
     """
     seen = []
     for _ in range(2):
@@ -193,13 +197,146 @@ def test_the_server_outlives_whatever_it_has_forked(enter, end):
         assert told(box) == 3.0
 
 
-def test_what_is_forked_ends_with_its_sandbox_its_keeper_and_its_server(enter):
+@contextmanager
+def process_of(server):
+    """The process that forks, above the keepers."""
+    yield next(one for one in psutil.Process(server._process.pid).children(recursive=True) if "python" in one.name())
+
+
+def test_process_1_has_the_filter_and_the_limits_of_its_script(enter):
+    """They share a user, so a script can write another program into it."""
+    code = """
+        def of(pid):
+            status = dict(line.split(":", 1) for line in open(f"/proc/{pid}/status"))
+            limits = open(f"/proc/{pid}/limits").read()
+            return [status["Seccomp"].strip(), status["CapEff"].strip(), limits, open(f"/proc/{pid}/oom_score_adj").read()]
+        say([of("self"), of(1)])
+    """
+    with enter(code) as box:
+        script, first = told(box)
+    assert script == first and first[0] == "2"
+
+
+def test_no_descriptor_of_the_hosts_files_is_left_when_a_script_begins(enter, tmp_path):
+    """Not in process 1 either: whoever is the files' owner could open them again for writing."""
+    (tmp_path / "given").write_text("x")
+    code = """
+        for number in os.listdir("/proc/1/fd"):
+            target = outcome(os.readlink, f"/proc/1/fd/{number}").strip("'").partition(":")[0]
+            assert target in ("/dev/null", "pipe", "socket", "ENOENT"), target  # first may not have closed its own yet
+        say("none")
+    """
+    for _ in range(5):
+        with enter(code, files={"given": tmp_path / "given"}) as box:
+            assert told(box) == "none"
+
+
+def test_many_files_with_long_names_are_handed_over(enter, tmp_path):
+    (tmp_path / "given").write_text("x")
+    files = {"/".join([f"{number:03}" + "é" * 100] * 8): tmp_path / "given" for number in range(sandbox.MAX_FILES)}
+    with enter("say(len(os.listdir()))", files=files) as box:
+        assert told(box) == sandbox.MAX_FILES
+
+
+def test_a_server_that_gets_no_process_refuses_one_request_and_goes_on(enter, tmp_path):
+    fails = tmp_path / "fails_once.py"
+    fails.write_text("""
+import errno, os
+server, fork, left = os.getpid(), os.fork, [True, False, True]
+def scarce():
+    if os.getpid() == server and not left.pop(0):
+        raise OSError(errno.EAGAIN, "no process")
+    return fork()
+os.fork = scarce
+""")
+    own = ForkServer([fails], preload=("fails_once",))
+    with enter("say(1)\ntime.sleep(60)", by=own) as box:
+        assert told(box) == 1
+        with pytest.raises(SandboxUnavailable, match="does not answer"), enter("say(2)", by=own):
+            pass
+        with enter("say(3)", by=own) as other:
+            assert told(other) == 3
+    own.close()
+
+
+def test_a_server_that_hangs_is_given_up_in_time(monkeypatch, tmp_path):
+    """Whether or not the submission has files: it has not heard of them."""
+    monkeypatch.setattr(forking, "ANSWER_TIMEOUT", 0.5)
+    shared = forking.Shared(lambda: ForkServer([COURSE_LIB], preload=()))
+    monkeypatch.setattr(forking, "course", shared)
+    server = shared.get()
+    (tmp_path / "given").write_text("x")
+    run = judge._Run.__new__(judge._Run)
+    run._trusted = False
+    with process_of(server) as process, ExitStack() as stack:
+        process.suspend()
+        assert run._begun(stack, {"given": tmp_path / "given"}).server is None
+        process.resume()
+    assert "does not answer" in shared.given_up and shared.get() is None
+    server.close()
+
+
+def test_a_keeper_that_hangs_does_not_keep_the_judge(enter):
+    with enter("say(1); time.sleep(60)") as box:
+        told(box)
+        processes = [box._root, *box._tree()]
+        box._root.suspend()
+    assert psutil.wait_procs(processes, timeout=10)[1] == []
+
+
+@pytest.mark.parametrize("stage", ["loading", "ready", "forked"])
+def test_everything_goes_when_the_grader_is_killed(tmp_path, stage):
+    slow = tmp_path / "slow.py"
+    slow.write_text("import time; time.sleep(1)")
+    script = tmp_path / "sleeper.py"
+    script.write_text("import os, time; os.fork(); os.setsid() if os.getpid() != 2 else None; time.sleep(100)")
+    grader = f"""
+import time
+from pathlib import Path
+import psutil
+from autograder.grading.forking import ForkServer
+from autograder.grading.sandbox import Sandbox
+server = ForkServer([Path({str(slow)!r})], preload=["slow"])
+stage = {stage!r}
+if stage != "loading":
+    server.wait_until_ready()
+if stage == "forked":
+    box = Sandbox(Path({str(script)!r}), server=server).__enter__()
+time.sleep(0.3)
+print(*[process.pid for process in psutil.Process().children(recursive=True)], flush=True)
+time.sleep(100)
+"""
+    with subprocess.Popen([sys.executable, "-c", grader], cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        processes = [psutil.Process(int(pid)) for pid in process.stdout.readline().split()]
+        assert len(processes) >= (5 if stage == "forked" else 2)
+        process.kill()
+    assert [one for one in psutil.wait_procs(processes, timeout=30)[1] if one.status() != psutil.STATUS_ZOMBIE] == []
+
+
+def test_neither_the_judge_nor_the_server_keeps_anything_of_what_has_ended(enter, server):
+    def kept():
+        with process_of(server) as process:
+            psutil.wait_procs(process.children(), timeout=10)
+            return process.num_fds(), len(process.children()), len(os.listdir("/proc/self/fd"))
+
+    counts = []
+    for _ in range(5):
+        with enter("say(1)") as box:
+            told(box)
+        counts.append(kept())
+    assert set(counts[1:]) == {counts[1]} and counts[1][1] == 0
+
+
+def test_what_is_forked_ends_with_its_sandbox_and_its_keeper_and_outlives_its_server(enter):
     sleep = """
         for _ in range(2):
             if os.fork() == 0:
                 os.setsid()
                 break
         say(os.getpid())
+        if os.getpid() == 2:
+            channel.recv(1)
+            say("alive")
         time.sleep(100)
     """
     own = ForkServer([], preload=())
@@ -210,10 +347,13 @@ def test_what_is_forked_ends_with_its_sandbox_its_keeper_and_its_server(enter):
             assert len(processes) >= 2
             if how == "keeper":
                 box._root.kill()
+                assert psutil.wait_procs(processes, timeout=10)[1] == []
             elif how == "server":
                 own.close()
-        _, alive = psutil.wait_procs(processes, timeout=10)
-        assert alive == [], how
+                box._socket.send(b"?")
+                while (said := told(box)) != "alive":
+                    assert isinstance(said, int)
+        assert psutil.wait_procs(processes, timeout=10)[1] == [], how
 
 
 def test_a_death_is_told_as_of_any_other_process(enter):
