@@ -218,8 +218,6 @@ def no_capabilities() -> None:
 def be_script(channel: int, name: str, source: bytes, path: list[str]) -> NoReturn:
     """Tell the judge that all that is ours has worked, and run the script."""
     code = compile(source, name, "exec", dont_inherit=True)
-    if numpys := sys.modules.get("numpy.random"):
-        numpys.seed()  # others see to that themselves when a process is forked
     sys.path.append(path[-1])
     sys.argv = [name, str(channel)]
     module = type(sys)("__main__")
