@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 from rich.console import Console
 from rich.table import Table
 
-from autograder.grading import sandbox
+from autograder.grading import forking, sandbox
 
 ROOT = Path(__file__).resolve().parents[1]
 PYTHONS = (3, 11), (3, 13)  # the oldest and the newest that the pins are tried with
@@ -41,6 +41,7 @@ def checks() -> list[Check]:
         _torch,
         _mujoco,
         _sandbox,
+        _forks,
         _flights,
         _nbgrader,
         _frozen,
@@ -118,6 +119,18 @@ def _sandbox() -> Check:
         return Check("sandbox", False, detail, " ".join(problem.remedy for problem in problems))
     user = "root, through a second layer that becomes nobody" if os.geteuid() == 0 else "an ordinary user"
     return Check("sandbox", True, f"bubblewrap works as {user}; torch imports inside")
+
+
+def _forks() -> Check:
+    """Whether one process that has torch loaded can fork those of submissions; without, each loads it anew."""
+    server = forking.course.get()
+    problems = sandbox.probe(torch=True, server=server) if server else []
+    why = forking.course.given_up or "; ".join(problem.what for problem in problems)
+    if why:
+        return Check(
+            "fork server", False, why, "Grading works, but takes some seconds longer for each submission.", required=False
+        )
+    return Check("fork server", True, "submissions share one process that has torch loaded")
 
 
 def _flights() -> Check:

@@ -22,7 +22,7 @@ import nbformat
 from nbformat import NotebookNode
 
 from autograder.authoring import assemble, chapter
-from autograder.grading import deadlines, intake, judge, names, sandbox, sources, verdicts
+from autograder.grading import deadlines, forking, intake, judge, names, sandbox, sources, verdicts
 from autograder.grading.deadlines import UNKNOWN, Deadlines, HandedIn, Rule
 from autograder.grading.verdicts import Verdict
 
@@ -75,6 +75,8 @@ def grade(
         for name in wanted:
             early.submit(judge.released, name)
         if not trusted:
+            if not scheduler:
+                forking.course.begin()
             sandbox.require()
     out.mkdir(parents=True, exist_ok=True)
     judging = _on_dask(tasks, scheduler, timeout) if scheduler else _here(tasks, jobs, timeout, trusted)

@@ -8,7 +8,7 @@ import os
 import shutil
 import sys
 import sysconfig
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
@@ -52,6 +52,11 @@ class Limits:
             "RLIMIT_AS": self.address_space, "RLIMIT_NPROC": self.processes, "RLIMIT_FSIZE": self.file_size,
             "RLIMIT_NOFILE": self.open_files, "RLIMIT_CORE": 0,
         }  # fmt: skip
+
+    def sizes(self, files: Iterable[int]) -> dict[str, int]:
+        """Bytes of each folder that can be written; of /work, beside the files with these descriptors."""
+        given = sum(os.fstat(descriptor).st_size + 4096 for descriptor in files)
+        return {"/dev/shm": self.shm, "/tmp": self.tmp, "/work": self.work + given}
 
 
 def closure(requirements: Sequence[str]) -> dict[str, metadata.Distribution]:
@@ -145,38 +150,70 @@ def layers(course: Sequence[Path], files: Mapping[str, int], limits: Limits, fil
         return [([_tool("bwrap")], [*APART, *mounts, *sealed])]
     again = [word for path in ("/python", "/site", "/course") for word in ("--ro-bind", path, path)]
     become_nobody = ["/tools/setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups", "--inh-caps=-all"]
+    tools = ["--dir", "/tools", *(word for tool in ("bwrap", "setpriv") for word in ("--ro-bind", _tool(tool), f"/tools/{tool}"))]
     return [
-        ([_tool("bwrap")], _outer(mounts)),
+        ([_tool("bwrap")], [*_outer([*tools, *mounts]), "--die-with-parent"]),
         ([*become_nobody, "/tools/bwrap"], [*again, *_system_libraries(), *LIBRARY_CACHE, *sealed]),
     ]
 
 
+def around_server(course: Sequence[Path]) -> tuple[list[str], list[str]]:
+    """The call of bwrap (words of the command, arguments for its --args) around the process that forks one for each submission.
+
+    It sees what they may see; they seal themselves. It ends when the judge's end of its socket is shut, whichever thread started it,
+    and where root starts it, it becomes nobody itself.
+    """
+    mounts = list(_host_mounts())
+    for path in course:
+        mounts += ["--ro-bind", str(path.resolve()), f"/course/{path.name}"]
+    ending = ["--perms", "1777", "--tmpfs", "/tmp", "--dir", "/work", "--chdir", "/"]
+    ending += [*_environment(), "--remount-ro", "/dev", "--remount-ro", "/"]
+    if os.geteuid() == 0:
+        return [_tool("bwrap")], [*_outer(mounts), *ending]
+    apart = ["--unshare-user", "--unshare-pid", *APART, "--uid", NOBODY, "--gid", NOBODY, "--cap-drop", "ALL", "--new-session"]
+    return [_tool("bwrap")], [*apart, "--clearenv", "--proc", "/proc", "--dev", "/dev", *mounts, *ending]
+
+
 def _outer(mounts: Sequence[str]) -> list[str]:
     """Root's layer; only what `mounts` says is carried into the inner one."""
-    arguments = ["--unshare-pid", *APART, "--die-with-parent", "--new-session"]
+    arguments = ["--unshare-pid", *APART, "--new-session"]
     # The kernel grants a new /proc (the inner layer's) only to those who see a whole one already: hence the bind.
     arguments += ["--cap-add", "CAP_SETUID", "--cap-add", "CAP_SETGID", "--bind", "/proc", "/proc", "--dev", "/dev"]
     # A folder that bwrap makes unasked is for its owner, root, only.
-    for folder in ("/usr", "/etc", "/python", "/python/bin", "/python/lib", "/site", "/course", "/tools", "/tmp"):
+    for folder in ("/usr", "/etc", "/python", "/python/bin", "/python/lib", "/site", "/course", "/tmp"):
         arguments += ["--dir", folder]
-    for tool in ("bwrap", "setpriv"):
-        arguments += ["--ro-bind", _tool(tool), f"/tools/{tool}"]
     return [*arguments, *mounts]
 
 
 def _sealed(limits: Limits, files: Mapping[str, int]) -> list[str]:
     """The layer around the learner: namespaces, a /proc, /dev, /work and /tmp of its own, and no way up."""
-    given = sum(os.fstat(fd).st_size + 4096 for fd in files.values())
     arguments = ["--unshare-user", "--disable-userns", "--unshare-pid", "--uid", NOBODY, "--gid", NOBODY, "--cap-drop", "ALL"]
     arguments += ["--die-with-parent", "--new-session", "--clearenv", "--proc", "/proc", "--dev", "/dev"]
-    sizes = {"/dev/shm": limits.shm, "/tmp": limits.tmp, "/work": limits.work + given}
-    for folder, size in sizes.items():
+    for folder, size in limits.sizes(files.values()).items():
         arguments += ["--size", str(size), "--tmpfs", folder]
     for name, fd in files.items():
         arguments += ["--perms", "0444", "--file", str(fd), f"/work/{name}"]
-    for key, value in {**ENVIRONMENT, "LD_LIBRARY_PATH": "/python/lib"}.items():
-        arguments += ["--setenv", key, value]
-    return [*arguments, "--remount-ro", "/dev", "--remount-ro", "/", "--chdir", "/work"]
+    return [*arguments, *_environment(), "--remount-ro", "/dev", "--remount-ro", "/", "--chdir", "/work"]
+
+
+def _environment() -> list[str]:
+    return [word for pair in {**ENVIRONMENT, "LD_LIBRARY_PATH": "/python/lib"}.items() for word in ("--setenv", *pair)]
+
+
+def handed_over(arguments: Sequence[str], passed: list[int]) -> list[str]:
+    """The words that tell bwrap where to read `arguments`: process 1 inside shows its own to learners. Adds a descriptor to `passed`."""
+    if not arguments:
+        return []
+    return ["--args", str(memory_file(b"".join(os.fsencode(argument) + b"\0" for argument in arguments), passed)), "--"]
+
+
+def memory_file(data: bytes, passed: list[int]) -> int:
+    """A descriptor, added to `passed`, from which a child reads `data`."""
+    descriptor = os.memfd_create("sandbox")
+    passed.append(descriptor)
+    os.write(descriptor, data)
+    os.lseek(descriptor, 0, os.SEEK_SET)
+    return descriptor
 
 
 def _tool(name: str) -> str:

@@ -12,7 +12,7 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -24,7 +24,7 @@ import course_lib
 from autograder import checks
 from autograder.authoring import artefacts, assemble, chapter, freeze
 from autograder.authoring.spec import Artefact
-from autograder.grading import flights, intake, repair
+from autograder.grading import flights, forking, intake, repair
 from autograder.grading.attempts import Attempt, Past, plan, share, suspect
 from autograder.grading.sandbox import Sandbox, SandboxDied, SandboxError, SandboxGarbage, SandboxTimeout, SandboxUnavailable
 from autograder.grading.verdicts import Item, Verdict, clean_text
@@ -153,6 +153,8 @@ def judge(submission: intake.Submission, release: Released, timeout: float = 60.
         repaired = repair.repair(submission.notebook, release.form)
         submission.notebook = repaired.notebook
         flags += repaired.ambiguous + repaired.flags
+        if not trusted:
+            forking.course.get()  # what it takes to start is nobody's time
         run = _Run(submission, release, timeout, trusted)
         found = run.findings()
         flags += run.flags
@@ -304,14 +306,27 @@ class _Run:
         """A sandbox; without the submission's files if they are not what intake has seen, or if twice none starts with them."""
         for last in (False, True) if self._submission.files else ():
             try:
-                return stack.enter_context(Sandbox(WORKER, [COURSE_LIB], self._submission.files, trusted=self._trusted))
+                return self._begun(stack, self._submission.files)
             except (ValueError, SandboxUnavailable) as error:
                 if last or isinstance(error, ValueError):
                     problem = error
                     break
-        sandbox = stack.enter_context(Sandbox(WORKER, [COURSE_LIB], trusted=self._trusted))
+        sandbox = self._begun(stack, {})
         if self._submission.files:
             self._flag(f"ignored_files: {problem}")
+        return sandbox
+
+    def _begun(self, stack: ExitStack, files: Mapping[str, Path]) -> Sandbox:
+        """Forked by this process's server; where that fails, begun anew, and by then it is not the submission that is to blame."""
+        server = None if self._trusted else forking.course.get()
+        if server is not None:
+            try:
+                return stack.enter_context(Sandbox(WORKER, [COURSE_LIB], files, server=server))
+            except SandboxUnavailable as error:
+                problem, unasked = str(error), isinstance(error.__cause__, forking.Refused)  # before it heard of the submission
+        sandbox = stack.enter_context(Sandbox(WORKER, [COURSE_LIB], files, trusted=self._trusted))
+        if server is not None and (unasked or not files):
+            forking.course.give_up(problem)
         return sandbox
 
     def _flag(self, text: str) -> None:

@@ -29,21 +29,21 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import psutil
 
-from autograder.grading import bubblewrap, seccomp
+from autograder.grading import bubblewrap, forking, seccomp
 from autograder.grading.bubblewrap import ENVIRONMENT, Limits, MiB
+from autograder.grading.forking import PYTHON_OPTIONS, ForkServer, Leash
 
 MAX_FRAME = 64 * MiB
 MAX_FILES = 200  # each is an open descriptor of ours while the sandbox starts
 MAX_FILES_SIZE = 256 * MiB  # together; they lie in memory
 START_TIMEOUT = 60.0  # seconds until the interpreter runs; only an overloaded machine needs more than 0.2
 TICK = 0.2  # seconds between two looks at the memory
-PYTHON_OPTIONS = ("-P", "-s", "-S", "-B")  # the standard library's path only, no bytecode; -I would ignore PYTHONHASHSEED
 
 # Runs first inside. Limits are set here, not outside, because RLIMIT_NPROC counts per user namespace and would count strangers
 # there. The one byte tells the judge that everything that is ours has worked.
@@ -115,6 +115,8 @@ class Sandbox:
       modules: files and folders that appear as /course/<their name>.
       files: name relative to /work → regular file of the host (copied when the sandbox starts).
       limits: see Limits.
+      server: forks the process, instead of starting it anew; then `modules` are those that it was given, and the file system is laid
+        out alike. The sandbox then lives as long as it is open, whatever becomes of the thread.
       trusted: run one's own code in an ordinary subprocess instead. Nothing is confined and no limit holds.
 
     Raises: SandboxUnavailable on entering; ValueError for a file or a name that intake should have refused: not a regular
@@ -128,16 +130,18 @@ class Sandbox:
         files: Mapping[str, Path] | None = None,
         limits: Limits = Limits(),  # noqa: B008 (frozen)
         trusted: bool = False,
+        server: ForkServer | None = None,
     ) -> None:
         self.script, self.modules, self.files = Path(script), [Path(module) for module in modules], dict(files or {})
-        self.limits, self.trusted = limits, trusted
+        self.limits, self.trusted, self.server = limits, trusted, server
         for name in self.files:
             parts = PurePosixPath(name).parts
             if not parts or name.startswith("/") or ".." in parts or "\0" in name or str(PurePosixPath(name)) != name:
                 raise ValueError(f"not a plain relative name: {name!r}")
         if len(self.files) > MAX_FILES:
             raise ValueError(f"{len(self.files)} files; at most {MAX_FILES} can be handed to the sandbox")
-        self._process: subprocess.Popen | None = None
+        self._process: subprocess.Popen | Leash | None = None
+        self._root: psutil.Process | None = None  # above all processes inside
         self._socket: socket.socket | None = None
         self._folder: tempfile.TemporaryDirectory | None = None
         self._looked = float("inf")  # at the memory; not before the learner's code runs
@@ -149,8 +153,7 @@ class Sandbox:
         try:
             with theirs, os.fdopen(errors, "rb") as complaints:
                 try:
-                    start = self._start_trusted if self.trusted else self._start_sealed
-                    start(theirs.fileno(), errors_in)
+                    self._start(theirs.fileno(), errors_in)
                 finally:
                     os.close(errors_in)
                 theirs.close()
@@ -170,40 +173,60 @@ class Sandbox:
     def __exit__(self, *exception) -> None:
         self.close()
 
-    def _start_sealed(self, channel: int, errors: int) -> None:
-        fds = [channel]
-        with ExitStack() as stack:
+    def _start(self, channel: int, errors: int) -> None:
+        if self.server and not self.trusted:
+            self._process = self._forked(self.server, channel, errors)
+            self._root = self._process.root
+        else:
+            self._process = self._trusted(channel, errors) if self.trusted else self._sealed(channel, errors)
+            self._root = psutil.Process(self._process.pid)
 
-            def handed_on(fd: int) -> int:
-                stack.callback(os.close, fd)
-                fds.append(fd)
-                return fd
-
-            def memory_file(data: bytes) -> str:
-                fd = handed_on(os.memfd_create("sandbox"))
-                os.write(fd, data)
-                os.lseek(fd, 0, os.SEEK_SET)
-                return str(fd)
-
-            files = {name: handed_on(_open_regular(path)) for name, path in self.files.items()}
-            if sum(os.fstat(fd).st_size for fd in files.values()) > MAX_FILES_SIZE:
-                raise ValueError(f"more than {MAX_FILES_SIZE // MiB} MiB of files cannot be handed to the sandbox")
+    def _sealed(self, channel: int, errors: int) -> subprocess.Popen:
+        passed = [channel]
+        try:
+            files = self._opened(passed)
             boot = json.dumps([channel, f"/course/{self.script.name}", ["/course", "/site", "/work"], self.limits.resources()])
             command = ["/python/bin/python", *PYTHON_OPTIONS, "-c", BOOTSTRAP, boot]
             try:
-                layers = bubblewrap.layers([self.script, *self.modules], files, self.limits, memory_file(seccomp.program()))
+                refused = str(bubblewrap.memory_file(seccomp.program(), passed))
+                layers = bubblewrap.layers([self.script, *self.modules], files, self.limits, refused)
             except (FileNotFoundError, NotImplementedError) as error:
                 raise SandboxUnavailable(f"The sandbox does not start: {error}.") from error
-            # bwrap is process 1 inside, where a learner reads its arguments and environment: it gets none that tell anything.
             for words, arguments in reversed(layers):
-                packed = b"".join(os.fsencode(argument) + b"\0" for argument in arguments)
-                command = [*words, "--args", memory_file(packed), "--", *command]
-            self._process = subprocess.Popen(
-                command, env={}, cwd="/", stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=errors, pass_fds=fds,
+                command = [*words, *bubblewrap.handed_over(arguments, passed), *command]
+            return subprocess.Popen(
+                command, env={}, cwd="/", stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=errors, pass_fds=passed,
                 start_new_session=True,
             )  # fmt: skip
+        finally:
+            for descriptor in passed[1:]:
+                os.close(descriptor)
 
-    def _start_trusted(self, channel: int, errors: int) -> None:
+    def _forked(self, server: ForkServer, channel: int, errors: int) -> Leash:
+        opened: list[int] = []
+        try:
+            opened.append(_open_regular(self.script))
+            files = self._opened(opened)
+            limits, sizes = self.limits.resources(), self.limits.sizes(files.values())
+            request = {"name": f"/course/{self.script.name}", "sizes": sizes, "files": list(files), "limits": limits}
+            return server.fork(channel, errors, request, opened)
+        except forking.Refused as error:
+            raise SandboxUnavailable(str(error)) from error
+        finally:
+            for descriptor in opened:
+                os.close(descriptor)
+
+    def _opened(self, opened: list[int]) -> dict[str, int]:
+        """Name → descriptor of each file handed in; they are added to `opened`. Raises ValueError."""
+        files = {}
+        for name, path in self.files.items():
+            files[name] = _open_regular(path)
+            opened.append(files[name])
+        if sum(os.fstat(fd).st_size for fd in files.values()) > MAX_FILES_SIZE:
+            raise ValueError(f"more than {MAX_FILES_SIZE // MiB} MiB of files cannot be handed to the sandbox")
+        return files
+
+    def _trusted(self, channel: int, errors: int) -> subprocess.Popen:
         self._folder = tempfile.TemporaryDirectory(prefix="trusted-")
         course, work = Path(self._folder.name, "course"), Path(self._folder.name, "work")
         for folder in (course, work):
@@ -215,7 +238,7 @@ class Sandbox:
             with open(_open_regular(path), "rb") as source, open(work / name, "xb") as copy:
                 shutil.copyfileobj(source, copy)
         boot = json.dumps([channel, str(course / self.script.name), [str(course), *site.getsitepackages(), str(work)], {}])
-        self._process = subprocess.Popen(
+        return subprocess.Popen(
             [sys.executable, *PYTHON_OPTIONS, "-c", BOOTSTRAP, boot],
             env={**ENVIRONMENT, "HOME": str(work), "MPLCONFIGDIR": str(work)}, cwd=work, stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL, stderr=errors, pass_fds=[channel], start_new_session=True,
@@ -281,8 +304,8 @@ class Sandbox:
     def _tree(self) -> list[psutil.Process]:
         """All processes inside, process 1 of the namespace first. A daemon cannot leave: its parent becomes that process 1."""
         with suppress(psutil.NoSuchProcess):
-            if self._process is not None:
-                return psutil.Process(self._process.pid).children(recursive=True)
+            if self._root is not None:
+                return self._root.children(recursive=True)
         return []
 
     def _death(self) -> SandboxDied:
@@ -311,9 +334,11 @@ class Sandbox:
                     self._process.wait(timeout=2)
             self._process.kill()
             self._process.wait()
+            if isinstance(self._process, Leash):
+                self._process.close()
             if not self.trusted:
                 psutil.wait_procs(tree[:1], timeout=5)
-            self._process = None
+            self._process = self._root = None
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -373,13 +398,16 @@ socket.socket(fileno=int(sys.argv[1])).sendall(len(frame).to_bytes(8, "big") + f
 """
 
 
-def probe(torch: bool = False) -> list[Problem]:
-    """What keeps a real sandbox from working here: nothing, if the list is empty. `torch` also imports torch inside (seconds)."""
+def probe(torch: bool = False, server: ForkServer | None = None) -> list[Problem]:
+    """What keeps a real sandbox, or one that `server` forks, from working here: nothing, if the list is empty.
+
+    `torch` also imports torch inside (seconds).
+    """
     with tempfile.TemporaryDirectory() as folder:
         script = Path(folder, "probe.py")
         script.write_text(PROBE.format(torch=torch))
         try:
-            with Sandbox(script) as sandbox:
+            with Sandbox(script, server=server) as sandbox:
                 answer = sandbox.receive(timeout=START_TIMEOUT).decode()
         except SandboxUnavailable as error:
             return [Problem("no sandbox", str(error))]

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from autograder import doctor
 from autograder.doctor import Check
-from autograder.grading import sandbox
+from autograder.grading import forking, sandbox
 
 
 def test_this_machine_works():
@@ -20,6 +20,7 @@ def test_this_machine_works():
         "torch",
         "MuJoCo",
         "sandbox",
+        "fork server",
         "flights",
         "nbgrader",
         "frozen checks",
@@ -52,6 +53,19 @@ def test_a_missing_or_different_package_is_named(monkeypatch, tmp_path):
 
 def test_a_build_label_does_not_make_another_version():
     assert doctor._satisfied(doctor.Requirement("torch==2.13.0"))  # installed as 2.13.0+cpu on machines without a GPU
+
+
+def test_a_fork_server_that_does_not_work_is_told_and_not_required(monkeypatch):
+    def refuses():
+        raise forking.Refused("user namespaces are switched off")
+
+    monkeypatch.setattr(forking, "course", forking.Shared(refuses))
+    check = doctor._forks()
+    assert (check.ok, check.required, check.detail) == (
+        False,
+        False,
+        "user namespaces are switched off",
+    ) and "longer" in check.remedy
 
 
 def test_a_broken_sandbox_is_reported_with_its_remedy(monkeypatch):
