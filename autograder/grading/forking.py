@@ -38,6 +38,7 @@ PRELOADED = (
     "course_lib.checks.stored",
 )
 START_TIMEOUT = 120.0  # seconds until torch is loaded, on a busy machine
+PATIENCE = 3  # refusals until a server is given up
 ANSWER_TIMEOUT = 10.0  # seconds until a server that is ready has forked; they are a submission's own
 
 
@@ -58,7 +59,7 @@ class ForkServer:
     def __init__(self, modules: Sequence[Path], preload: Sequence[str] = PRELOADED) -> None:
         self.modules = [Path(module) for module in modules]
         self._lock = threading.Lock()
-        self._ready = False
+        self._ready = self.hangs = False
         self._socket, theirs = socket.socketpair()
         complaints, complaints_in = os.pipe()
         self._complaints = os.fdopen(complaints, "rb")
@@ -119,6 +120,7 @@ class ForkServer:
             return Leash(ours, request | {"filter": seccomp.program().hex()}, handed)
         except (OSError, psutil.Error, NotImplementedError) as error:
             ours.close()
+            self.hangs = self.hangs or isinstance(error, TimeoutError)
             raise Refused(f"the server does not answer: {error}") from error
 
     def close(self, keep_complaints: bool = False) -> None:
@@ -139,6 +141,7 @@ class Shared:
         self._make, self._lock = make, threading.Lock()
         self._server: ForkServer | None = None
         self._former: ForkServer | None = None
+        self._refusals = 0
         self.given_up = ""  # why
 
     def begin(self) -> None:
@@ -157,10 +160,16 @@ class Shared:
             try:
                 self._server.wait_until_ready()
             except Refused as error:
-                self.give_up(str(error))
+                self._give_up(str(error))
         return self._server
 
-    def give_up(self, why: str) -> None:
+    def refused(self, why: str) -> None:
+        """It did not fork, though a process of its own began: a machine may lack a process once, but not again and again."""
+        self._refusals += 1
+        if self._refusals >= PATIENCE or (self._server and self._server.hangs):
+            self._give_up(why)
+
+    def _give_up(self, why: str) -> None:
         """Have none from here on; what the one there was has forked lives on."""
         with self._lock:
             self._former, self._server, self.given_up = self._server or self._former, None, why

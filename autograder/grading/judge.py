@@ -326,7 +326,7 @@ class _Run:
                 problem, unasked = str(error), isinstance(error.__cause__, forking.Refused)  # before it heard of the submission
         sandbox = stack.enter_context(Sandbox(WORKER, [COURSE_LIB], files, trusted=self._trusted))
         if server is not None and (unasked or not files):
-            forking.course.give_up(problem)
+            forking.course.refused(problem)
         return sandbox
 
     def _flag(self, text: str) -> None:

@@ -412,9 +412,11 @@ def test_a_server_that_stops_working_is_given_up_and_what_it_has_forked_lives(mo
     monkeypatch.setattr(server, "fork", lambda *_: (_ for _ in ()).throw(Refused("it does not answer")))
     run = judge._Run.__new__(judge._Run)
     run._trusted = False
-    with ExitStack() as stack:
-        assert run._begun(stack, {}).server is None
-    assert "does not answer" in shared.given_up and shared.get() is None
+    for refusals in range(1, forking.PATIENCE + 1):
+        with ExitStack() as stack:
+            assert run._begun(stack, {}).server is None
+        assert (shared.get() is None) == (refusals == forking.PATIENCE)
+    assert "does not answer" in shared.given_up
     monkeypatch.undo()
     with enter("say(1)", by=server) as box:
         assert told(box) == 1

@@ -9,7 +9,7 @@ import pytest
 import safetensors.torch
 import torch
 
-from autograder.grading import intake, judge
+from autograder.grading import forking, intake, judge
 from autograder.grading.attempts import Attempt, Past
 from autograder.grading.sandbox import SandboxUnavailable
 from course_lib.checks.cases import FrozenCase, FrozenExercise, Observation
@@ -149,6 +149,14 @@ def _starting(*outcomes):
     return Box
 
 
+@pytest.fixture
+def without_server(monkeypatch):
+    def refuses():
+        raise forking.Refused("not here")
+
+    monkeypatch.setattr(forking, "course", forking.Shared(refuses))
+
+
 @pytest.mark.parametrize(
     ("outcomes", "files", "flags"),
     [
@@ -158,7 +166,7 @@ def _starting(*outcomes):
         ([ValueError("changed")], set(), 1),
     ],
 )
-def test_files_with_which_no_sandbox_starts_are_left_out(monkeypatch, outcomes, files, flags):
+def test_files_with_which_no_sandbox_starts_are_left_out(monkeypatch, without_server, outcomes, files, flags):
     attempt = run("def f(): ...")
     attempt._submission.files["a"] = None
     monkeypatch.setattr(judge, "Sandbox", _starting(*outcomes))
@@ -166,7 +174,7 @@ def test_files_with_which_no_sandbox_starts_are_left_out(monkeypatch, outcomes, 
         assert set(box.files) == files and len(attempt.flags) == flags
 
 
-def test_a_sandbox_that_never_starts_is_ours():
+def test_a_sandbox_that_never_starts_is_ours(without_server):
     attempt = run("def f(): ...")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(judge, "Sandbox", _starting(*[SandboxUnavailable("no")] * 3))
