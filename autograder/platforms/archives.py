@@ -39,11 +39,15 @@ class Refused(ValueError):
 
 @dataclass(frozen=True)
 class Entry:
-    """One file of a download: its path with "/" between the parts, its size as far as known, and a way to read it."""
+    """One file of a download: its path with "/" between the parts, its size as far as known, and a way to read it.
+
+    `given` is its path in the download, where `path` is another.
+    """
 
     path: str
     size: int
     open: Callable[[], IO[bytes]]
+    given: str = ""
 
     @property
     def name(self) -> str:
@@ -55,7 +59,16 @@ class Entry:
 
     def under(self, prefix: str) -> Entry:
         """The same file, named from the folder `prefix` on."""
-        return Entry(self.path.removeprefix(prefix), self.size, self.open)
+        return self.renamed(self.path.removeprefix(prefix))
+
+    def renamed(self, path: str) -> Entry:
+        """The same file under another path."""
+        return Entry(path, self.size, self.open, self.shown)
+
+    @property
+    def shown(self) -> str:
+        """The path by which whoever has the download finds the file."""
+        return self.given or self.path
 
 
 def read(entry: Entry, limit: int = MAX_FILE) -> bytes:
@@ -235,5 +248,10 @@ def nested(entry: Entry, stack: ExitStack, problems: list[str]) -> list[Entry]:
     with open(path, "wb") as spool:
         for piece in chunks(entry):
             spool.write(piece)
+
+    def opener(member: zipfile.ZipInfo) -> Callable[[], IO[bytes]]:
+        return lambda: zipfile.ZipFile(path).open(member)
+
     with ExitStack() as own:
-        return of_zip(_opener(path), entry.path, own, problems, lambda member: lambda: zipfile.ZipFile(path).open(member))
+        inside = of_zip(_opener(path), entry.shown, own, problems, opener)
+    return [Entry(file.path, file.size, file.open, f"{entry.shown}/{file.path}") for file in inside]

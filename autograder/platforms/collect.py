@@ -263,9 +263,9 @@ class _Sorting:
             try:
                 inside = archives.nested(entry, self.stack, self.done.problems)
                 folder = f"{entry.path.rpartition('/')[0]}/".lstrip("/") if one.platform == "canvas" else ""
-                result += [Entry(folder + file.path, file.size, file.open) for file in inside if _is_work(file)]
+                result += [file.renamed(folder + file.path) for file in inside if _is_work(file)]
             except Refused as reason:
-                self.done.problems.append(f"{one.download}: {entry.name} {reason}")
+                self.done.problems.append(f"{entry.shown}: {reason}")
                 result.append(entry)
         return result
 

@@ -30,7 +30,7 @@ MAX_METADATA = 64 << 20
 MAX_TEXT = 1 << 20
 CANVAS = re.compile(r"(?:(?!LATE_)(?P<name>.+?)_)?(?P<late>LATE_)?(?P<id>\d+|anon_[^\W_]+)_(?P<file>\d+)_(?P<rest>.+)", re.S)
 CANVAS_TEXT = re.compile(r"(?:(?!LATE_)(?P<name>.+?)_)?(?P<late>LATE_)?(?P<id>\d+|anon_[^\W_]+)_(?P<rest>text|link)\.html", re.S)
-MOODLE = re.compile(r"(?P<name>[^_]+)(?:_(?P<id>\d+))?_assignsubmission_(?P<kind>[a-z]+)_(?P<rest>.*)", re.S)
+MOODLE = re.compile(r"(?P<name>.+?)(?:_(?P<id>\d+))?_assignsubmission_(?P<kind>[a-z]+)_(?P<rest>.*)", re.S)
 BLACKBOARD = re.compile(
     r"(?P<title>.*)_(?P<login>[^_]+(?:_[^_]+)*?)_[^\W\d_]+_(?P<at>\d{4}(?:-\d\d){5})(?:_(?P<rest>.+)|\.txt)", re.S
 )
@@ -38,6 +38,7 @@ GRADESCOPE = re.compile(r"submission_(\d+)")
 METADATA = "submission_metadata.yml"
 WANTED = (":submitters", ":created_at", ":name", ":sid", ":email")  # of its keys
 MAX_NESTING = 50
+AGAIN = "; if it is somebody's work, rename it so and collect again"
 EXCHANGE = re.compile(r"(?P<student>[^+]+)\+(?P<assignment>[^+]+)\+(?P<at>[^+]+(?:\+\d{4})?)(?:\+.*)?")
 
 
@@ -79,7 +80,7 @@ class Found:
 
     def add(self, other: Found, prefix: str) -> None:
         self.handed += [replace(one, download=prefix + one.download) for one in other.handed]
-        self.problems += other.problems
+        self.problems += [prefix + line for line in other.problems]
         self.notes += other.notes
 
 
@@ -175,7 +176,7 @@ def _canvas(level: Level, reading: _Reading) -> Found:
         if match:
             units[match["id"]].append((match, inside[0]))
         else:
-            found.problems.append(f"{name}: is not named as Canvas names files (name_userid_fileid_filename)")
+            found.problems.append(f"{name}: is not named as Canvas names files (name_userid_fileid_filename){AGAIN}")
     for number, parts in units.items():
         parts.sort(key=lambda part: int(part[0].groupdict().get("file") or 0))
         match, first = parts[-1]
@@ -183,7 +184,7 @@ def _canvas(level: Level, reading: _Reading) -> Found:
         for one, entry in parts:
             rest = one["rest"] if "file" in one.groupdict() else f"{one['rest']}.html"
             order = max(order, int(one.groupdict().get("file") or 0))
-            files.append(Entry(f"{one.groupdict().get('file') or '0'}/{rest}", entry.size, entry.open))
+            files.append(entry.renamed(f"{one.groupdict().get('file') or '0'}/{rest}"))
         late = any(one["late"] for one, _ in parts)
         found.handed.append(Handed("canvas", tuple(files), first.path, number, match["name"], late=late, order=order))
     return found
@@ -203,7 +204,7 @@ def _moodle(level: Level, reading: _Reading) -> Found:
     for name, inside in level.items():
         match = MOODLE.fullmatch(name)
         if not match:
-            found.problems.append(f"{name}: is not named as Moodle names submissions (Name_id_assignsubmission_file_)")
+            found.problems.append(f"{name}: is not named as Moodle names submissions (Name_id_assignsubmission_file_){AGAIN}")
             continue
         key = (match["name"], match["id"])
         if match["kind"] == "file" or key not in folders:
@@ -211,7 +212,7 @@ def _moodle(level: Level, reading: _Reading) -> Found:
         for entry in inside:
             units[key].append((match["rest"] if _is_file(name, inside) else entry.path.removeprefix(f"{name}/"), entry))
     for (who, number), parts in units.items():
-        files = tuple(Entry(path, entry.size, entry.open) for path, entry in parts)
+        files = tuple(entry.renamed(path) for path, entry in parts)
         found.handed.append(Handed("moodle", files, folders[who, number], number, who))
     return found
 
@@ -231,7 +232,7 @@ def _gradescope(level: Level, reading: _Reading) -> Found:
             continue
         match = GRADESCOPE.fullmatch(name.partition(".")[0])
         if not match and name not in metadata:
-            found.problems.append(f"{name}: is not named as Gradescope names submissions (submission_ID)")
+            found.problems.append(f"{name}: is not named as Gradescope names submissions (submission_ID){AGAIN}")
             continue
         files = tuple(inside if _is_file(name, inside) else (entry.under(f"{name}/") for entry in inside))
         one = _mapping(metadata.get(name))
@@ -327,12 +328,14 @@ def _blackboard(level: Level, reading: _Reading) -> Found:
         if match:
             units[logins[name], match["at"]].append((match, inside[0]))
         else:
-            found.problems.append(f"{name}: is not named as Blackboard names files (Assignment_login_attempt_time_filename)")
+            found.problems.append(
+                f"{name}: is not named as Blackboard names files (Assignment_login_attempt_time_filename){AGAIN}"
+            )
     for (login, at), parts in units.items():
-        files = tuple(Entry(match["rest"], entry.size, entry.open) for match, entry in parts if match["rest"])
+        files = tuple(entry.renamed(match["rest"]) for match, entry in parts if match["rest"])
         told = next((entry for match, entry in parts if not match["rest"]), None)
         if told and not files:  # what was typed into Blackboard is all that there is
-            files = (Entry("submission.txt", told.size, told.open),)
+            files = (told.renamed("submission.txt"),)
         moment = datetime.strptime(at, "%Y-%m-%d-%H-%M-%S") if _is_date(at) else None
         aware = moment.replace(tzinfo=reading.zone) if moment and reading.zone else None
         shown = next((entry.path for match, entry in parts if match["rest"]), parts[0][1].path)
@@ -464,7 +467,7 @@ def _by_pattern(files: list[Entry], pattern: re.Pattern[str]) -> Found:
     for (student, stamp), members in units.items():
         parts = members[-1][0]
         name = " ".join(filter(None, (parts.get("first_name"), parts.get("last_name")))) or None
-        renamed = tuple(Entry(_named(one["file_id"], entry.name), entry.size, entry.open) for one, entry in members)
+        renamed = tuple(entry.renamed(_named(one["file_id"], entry.name)) for one, entry in members)
         written = re.sub(r"(\d{4}-\d\d-\d\d)-(\d\d)-(\d\d)-(\d\d)", r"\1 \2:\3:\4", stamp)
         at = _time(written)
         order = int(re.sub(r"\D", "", stamp) or 0)

@@ -118,7 +118,7 @@ def _filled(path: Path, kinds: list[str | None], rows: list[list[str]]) -> Roste
         for kind in KEYS:
             if kind not in values:
                 continue
-            value = re.sub(r"(?i)^participant ", "", values[kind]) if kind == "id" else values[kind]
+            value = re.sub(r"^[^\d\W][^\d]*\s(?=\d+$)", "", values[kind]) if kind == "id" else values[kind]
             key = (kind, _key(value))
             if roster.students.setdefault(key, student) != student:
                 if kind == "name":  # two people of one name: that tells nothing about either

@@ -104,6 +104,30 @@ def test_moodle_in_both_forms(tmp_path, into, made):
     assert papers(into)[("Zoë Ågren", "ch44")] == TWO and by_student(done)["Default group"]["platform_id"] is None
 
 
+@pytest.mark.parametrize("made", [zipped, folder])
+def test_underscores_in_what_moodle_calls_a_person(tmp_path, into, made):
+    files = {
+        "Teilnehmer_in 9006_9006_assignsubmission_file_/ch44.ipynb": ONE,
+        "Jo_7_8_assignsubmission_file_/a_assignsubmission_file_b.py": b"",
+        "Jo_7_8_assignsubmission_file_/ch44.ipynb": TWO,
+        "Group_A_assignsubmission_file_/ch44.ipynb": THREE,
+    }
+    (tmp_path / "names.csv").write_text("Participant,Student\nTeilnehmer/in 9006,jane\n8,jo\n")
+    done = collect.collect([made(tmp_path / "moodle", files)], into, names=tmp_path / "names.csv")
+    assert papers(into) == {("jane", "ch44"): ONE, ("jo", "ch44"): TWO, ("Group_A", "ch44"): THREE}
+    assert by_student(done)["jo"]["name"] == "Jo_7" and by_student(done)["Group_A"]["platform_id"] is None
+    assert len(done.problems) == 1 and "Group_A" in done.problems[0]
+    flat = {"Ab_c_9_assignsubmission_file_ch44_1_assignsubmission_file_.ipynb": ONE}
+    done = collect.collect([made(tmp_path / "flat", flat)], tmp_path / "more")
+    assert [(one["name"], one["platform_id"]) for one in done.entries] == [("Ab_c", "9")]
+
+
+def test_a_file_that_no_platform_names_so_is_told_with_a_cure(tmp_path, into):
+    files = {"Jane_1_assignsubmission_file_/ch44.ipynb": ONE, "stray/ch44.ipynb": TWO}
+    done = collect.collect([folder(tmp_path / "a", files)], into)
+    assert len(done.problems) == 1 and "rename it so and collect again" in done.problems[0]
+
+
 def test_a_zip_for_each_student_is_opened_and_a_zip_in_that_is_not(tmp_path, into):
     inner = zipped(
         tmp_path / "i.zip", {"ch44/ch44.ipynb": ONE, "ch44/helpers.py": b"", "__MACOSX/ch44/._ch44.ipynb": b"x"}
@@ -522,6 +546,18 @@ def test_names_that_lead_elsewhere_are_refused(tmp_path, into, name, said):
     done = collect.collect([hostile(tmp_path, name)], into)
     assert papers(into) == {("good", "ch44"): ONE} and len(done.problems) == 1 and said in done.problems[0]
     assert "\x1b" not in done.problems[0] and {path.name for path in tmp_path.iterdir()} == {"a.zip", "submitted"}
+
+
+def test_lines_name_files_as_the_download_does(tmp_path, into):
+    inner = hostile(tmp_path, "../../evil.ipynb").read_bytes()
+    files = {"canvas.zip/doe_7_7016_x.zip": inner, "canvas.zip/roe_8_7017_y.zip": b"PK no zip", "canvas.zip/what.txt": b""}
+    files |= {"moodle/Jo Poe_9_assignsubmission_file_/z.zip": inner, "moodle/Jo Roe_8_assignsubmission_file_z.zip": inner}
+    done = collect.collect([folder(tmp_path / "all", files)], into)
+    said = sorted(line.partition(": ")[0] for line in done.problems if "no notebook" not in line)
+    assert said == [
+        "canvas.zip/doe_7_7016_x.zip", "canvas.zip/roe_8_7017_y.zip", "canvas.zip/what.txt",
+        "moodle/Jo Poe_9_assignsubmission_file_/z.zip", "moodle/Jo Roe_8_assignsubmission_file_z.zip",
+    ]  # fmt: skip
 
 
 def test_links_in_zips_and_folders_are_not_followed(tmp_path, into):
