@@ -108,12 +108,17 @@ def read(
     Raises: archives.Refused, going on from the download's name.
     """
     found = Found()
-    files = archives.entries(download, stack, found.problems)
+    files = archives.entries(download, stack, found.problems, _is_named)
     if pattern:
         found.add(_by_pattern(files, pattern), "")
     else:
         _recognise(files, "", found, stack, _Reading(known, zone, force))
     return found
+
+
+def _is_named(name: str) -> bool:
+    """Whether a platform gives such a name to what somebody has handed in, which a person's name may begin with a dot."""
+    return any(naming.fullmatch(name) for naming in (CANVAS, CANVAS_TEXT, MOODLE, BLACKBOARD, EXCHANGE))
 
 
 @dataclass(frozen=True)
@@ -136,7 +141,12 @@ def _recognise(files: list[Entry], prefix: str, found: Found, stack: ExitStack, 
         elif inside[0].path == name and name.lower().endswith(".zip") and depth < 4 and not prefix.endswith(".zip/"):
             try:
                 _recognise(
-                    archives.nested(inside[0], stack, found.problems), f"{prefix}{name}/", found, stack, reading, depth + 1
+                    archives.nested(inside[0], stack, found.problems, _is_named),
+                    f"{prefix}{name}/",
+                    found,
+                    stack,
+                    reading,
+                    depth + 1,
                 )
             except Refused as reason:
                 found.problems.append(f"{prefix}{name}: {reason}")

@@ -80,6 +80,33 @@ def test_names_with_underscores_anonymous_students_and_text_entries_of_canvas(tm
     assert len(done.problems) == 1 and "poe handed in no notebook (text.html)" in done.problems[0]
 
 
+@pytest.mark.parametrize("made", [zipped, folder])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "..hidden_121_7023_ch44.ipynb",
+        "._121_7023_ch44.ipynb",
+        ".._9_assignsubmission_file_/ch44.ipynb",
+        ".jo_9_assignsubmission_file_ch44.ipynb",
+        ".GAE_jo_attempt_2026-11-20-12-30-00_ch44.ipynb",
+        ".jo+ch44+2026-11-20 10:00:00.000000 UTC+x/ch44.ipynb",
+    ],
+)
+def test_a_person_whose_name_begins_with_a_dot_is_not_overlooked(tmp_path, into, made, name):
+    collect.collect([made(tmp_path / "download", {name: ONE})], into)
+    assert list(papers(into).values()) == [ONE]
+    zipped(tmp_path / "inner.zip", {name: ONE})
+    collect.collect([made(tmp_path / "all", {"inner.zip": (tmp_path / "inner.zip").read_bytes()})], tmp_path / "more")
+    assert list(papers(tmp_path / "more").values()) == [ONE]
+
+
+@pytest.mark.parametrize("made", [zipped, folder])
+def test_what_systems_and_editors_write_beside_is_nobodys(tmp_path, into, made):
+    left = ("._doejane_12345_678901_ch44.ipynb", "__MACOSX/._li_1_2_ch44.ipynb", "~$ejane_12345_678901_a.docx", ".DS_Store")
+    done = collect.collect([made(tmp_path / "download", CANVAS | dict.fromkeys(left, b"x"))], into)
+    assert len(papers(into)) == 3 and not done.problems
+
+
 def test_two_people_of_one_name_are_two_students_whenever_they_hand_in(tmp_path, into):
     collect.collect([zipped(tmp_path / "a.zip", {"doejane_1_5_ch44.ipynb": ONE})], into)
     collect.collect([zipped(tmp_path / "b.zip", {"doejane_2_6_ch44.ipynb": TWO, "doejane_1_5_ch44.ipynb": ONE})], into)
