@@ -38,6 +38,7 @@ from autograder.platforms.downloads import Handed
 COLLECTED = ".collected.json"
 SCHEMA = 1
 PEOPLES_IDS = ("canvas", "moodle")  # where an id is a person's, and names are what people are called
+ARCHIVE = re.compile(r"\.(?:zip|7z|rar|tar|tgz|tbz2?|txz|(?:tar\.)?(?:gz|bz2|xz|zst))$", re.I)
 NOTEBOOK = re.compile(r"\.ipynb(?:\.json|\.txt)?$", re.I)
 COPIED = re.compile(r"^copy of | ?\(\d+\)$|-\d+$|-copy\d*$|_\d+$", re.I)  # what systems add to a name that is taken
 
@@ -187,6 +188,7 @@ class _Sorting:
     before: dict[str, tuple[str, str | None]]
     stack: ExitStack
     done: Collected
+    strangers: dict[str, Handed] = field(default_factory=dict)  # person → what they handed in, where nothing says whose it is
 
     def papers(self, handed: Sequence[Handed], source: str) -> list[Paper]:
         labels = self._labels(handed)
@@ -194,8 +196,6 @@ class _Sorting:
         papers, without = [], []
         for one, files in opened:
             student = labels[one.person]
-            if one.unknown:
-                self.done.problems.append(f"{one.download}: {one.unknown}")
             found = self._of_one(one, student, files)
             papers += found
             if not found:
@@ -205,13 +205,18 @@ class _Sorting:
             named = self.assignment or one.assignment or (next(iter(common)) if len(common) == 1 else None)
             seen = ", ".join(entry.name for entry in files[:3]) or "nothing at all"
             notebook = any(NOTEBOOK.search(entry.name) for entry in files)
-            where = (
-                f"collected as it is, for {named}" if named and files else "not collected; --assignment says for which chapter"
-            )
+            packed = ", ".join(entry.name for entry in files if ARCHIVE.search(entry.name))
+            if named and files:
+                where = f"collected as it is, for {named}"
+            else:
+                where = "not collected" if packed or not files else "not collected; --assignment says for which chapter"
+            if packed:
+                where += f"; unpack {packed}, name the notebook as the download names its files, and collect again"
             what = "no notebook that one can tell to be of a chapter" if notebook else "no notebook"
             self.done.problems.append(f"{one.download}: {student} handed in {what} ({seen}); {where}")
             if named and files:
                 papers.append(self._paper(one, student, named, self._beside(one, files, "", named, None)))
+        self._tell_strangers(labels, {paper.attempt.student for paper in papers})
         if any(one.zoneless for one in handed):
             self.done.notes.append(
                 f"{source}: its times have no zone and are not used; a file with `zone: Europe/London`, given by --due, tells it"
@@ -245,10 +250,26 @@ class _Sorting:
                         f"{one.download}: --names has {mapped} for {first} and for {one.platform_id}, whose work is taken for attempts of"
                         " one person; if they are two, give each a student"
                     )
-            if self.people and not mapped and not one.unknown:
-                told = ", ".join(filter(None, (one.platform_id, one.login, one.email, one.name)))
-                self.done.problems.append(f"{one.download}: --names does not have {told}; collected as {default}")
+            if not mapped:
+                self.strangers[one.person] = one
         return labels
+
+    def _tell_strangers(self, labels: dict[str, str], collected: Collection[str]) -> None:
+        """Name whoever is in neither the download nor --names, and as whom their work was collected, if it was."""
+        for person, one in self.strangers.items():
+            under = f"; collected as {labels[person]}" if labels[person] in collected else ""
+            if one.unknown:
+                cure = f", until --names maps {one.platform_id or 'it'} to a student" if under else ""
+                self.done.problems.append(f"{one.download}: {one.unknown}{under}{cure}")
+            elif self.people:
+                told = ", ".join(dict.fromkeys(filter(None, (one.platform_id, one.login, one.email, one.name))))
+                cure = ""
+                if one.platform == "github" and one.login == one.platform_id:
+                    cure = (
+                        "; a folder around the clones that is named SLUG-submissions tells where in SLUG-LOGIN the login begins"
+                    )
+                self.done.problems.append(f"{one.download}: --names does not have {told}{under}{cure}")
+        self.strangers.clear()
 
     def _opened(self, one: Handed) -> list[Entry]:
         """A submission's files; of one without a notebook, those in its zips."""

@@ -38,6 +38,7 @@ GRADESCOPE = re.compile(r"submission_(\d+)")
 METADATA = "submission_metadata.yml"
 WANTED = (":submitters", ":created_at", ":name", ":sid", ":email")  # of its keys
 MAX_NESTING = 50
+SUBMISSIONS = re.compile(r"(.+)-submissions(?: ?\(\d+\)| \d+)?(?:\.zip)?", re.I | re.S)
 AGAIN = "; if it is somebody's work, rename it so and collect again"
 EXCHANGE = re.compile(r"(?P<student>[^+]+)\+(?P<assignment>[^+]+)\+(?P<at>[^+]+(?:\+\d{4})?)(?:\+.*)?")
 
@@ -112,7 +113,7 @@ def read(
     if pattern:
         found.add(_by_pattern(files, pattern), "")
     else:
-        _recognise(files, "", found, stack, _Reading(known, zone, force))
+        _recognise(files, "", found, stack, _Reading(known, zone, force, download.resolve().name))
     return found
 
 
@@ -126,6 +127,16 @@ class _Reading:
     known: frozenset[str]
     zone: tzinfo | None
     force: str | None
+    folder: str  # the name of the folder or zip that is looked at
+
+    def of(self, folder: str) -> _Reading:
+        return replace(self, folder=folder)
+
+    @property
+    def slug(self) -> str | None:
+        """What the repositories in this folder begin with, before a dash and the login: GitHub Classroom clones into SLUG-submissions."""
+        match = SUBMISSIONS.fullmatch(self.folder)
+        return match[1].casefold() if match else None
 
 
 def _recognise(files: list[Entry], prefix: str, found: Found, stack: ExitStack, reading: _Reading, depth: int = 0) -> None:
@@ -137,17 +148,12 @@ def _recognise(files: list[Entry], prefix: str, found: Found, stack: ExitStack, 
             return
     for name, inside in level.items():
         if inside[0].path != name and depth < 4:
-            _recognise([entry.under(f"{name}/") for entry in inside], f"{prefix}{name}/", found, stack, reading, depth + 1)
+            files = [entry.under(f"{name}/") for entry in inside]
+            _recognise(files, f"{prefix}{name}/", found, stack, reading.of(name), depth + 1)
         elif inside[0].path == name and name.lower().endswith(".zip") and depth < 4 and not prefix.endswith(".zip/"):
             try:
-                _recognise(
-                    archives.nested(inside[0], stack, found.problems, _is_named),
-                    f"{prefix}{name}/",
-                    found,
-                    stack,
-                    reading,
-                    depth + 1,
-                )
+                files = archives.nested(inside[0], stack, found.problems, _is_named)
+                _recognise(files, f"{prefix}{name}/", found, stack, reading.of(name), depth + 1)
             except Refused as reason:
                 found.problems.append(f"{prefix}{name}: {reason}")
         elif name != REPOSITORY:
@@ -256,7 +262,7 @@ def _gradescope(level: Level, reading: _Reading) -> Found:
                 replace(base, name=_text(person.get(":name")), login=sid or (email or "").partition("@")[0] or None, email=email)
             )
         if not people:
-            unknown = f"{METADATA} does not say whose it is; collected under this name, until --names maps {base.platform_id} to a student"
+            unknown = f"{METADATA} does not say whose it is"
             found.handed.append(replace(base, unknown=unknown))
     return found
 
@@ -392,15 +398,18 @@ def _blackboard_name(told: Entry | None, login: str) -> str | None:
 
 def _fits_github(level: Level, reading: _Reading) -> bool:
     folders = [name for name, inside in level.items() if not _is_file(name, inside)]
-    return any(_is_repository(level[name]) and REPOSITORY in {entry.parts[1] for entry in level[name]} for name in folders) or (
-        bool(folders) and all(_repository_login(name, reading.known)[1] for name in folders)
-    )
+    if any(_is_repository(level[name]) and REPOSITORY in {entry.parts[1] for entry in level[name]} for name in folders):
+        return True
+    told = [_repository_login(name, reading)[1] for name in folders]
+    return any(told) if reading.slug else bool(told) and all(told)
 
 
-def _repository_login(name: str, known: frozenset[str]) -> tuple[str | None, str | None]:
-    """(assignment, login) of a repository that is named `ch44-janedoe`."""
+def _repository_login(name: str, reading: _Reading) -> tuple[str | None, str | None]:
+    """(assignment, login) of a repository that is named `ch44-janedoe`, or as the folder around it says."""
+    if reading.slug and name.casefold().startswith(f"{reading.slug}-"):
+        return in_name(reading.slug, reading.known), name[len(reading.slug) + 1 :] or None
     head, _, login = name.partition("-")
-    return (head.lower(), login) if head.lower() in known and login else (None, None)
+    return (head.lower(), login) if head.lower() in reading.known and login else (None, None)
 
 
 def _github(level: Level, reading: _Reading) -> Found:
@@ -409,7 +418,7 @@ def _github(level: Level, reading: _Reading) -> Found:
         if _is_file(name, inside):
             found.problems.append(f"{name}: lies beside the clones, in none of them")
             continue
-        assignment, login = _repository_login(name, reading.known)
+        assignment, login = _repository_login(name, reading)
         files = tuple(entry.under(f"{name}/") for entry in inside if REPOSITORY not in entry.parts)
         found.handed.append(Handed("github", files, name, name, None, login or name, assignment=assignment))
     return found

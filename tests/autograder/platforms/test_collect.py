@@ -266,6 +266,24 @@ def test_github(tmp_path, into):
     assert sorted(tree(into / "li")) == ["ch44/ch44.ipynb", "ch44/mine/more.py"]
 
 
+@pytest.mark.parametrize("slug", ["hw-ch44", "my-class-GAE"])
+def test_github_classrooms_folder_says_what_repositories_begin_with(tmp_path, into, slug):
+    files = {f"{slug}-janedoe/ch44.ipynb": ONE, f"{slug}-john-doe/sub/ch44.ipynb": TWO, f"{slug.lower()}-li/ch44.ipynb": THREE}
+    (tmp_path / "names.csv").write_text("login,student\njanedoe,jane\njohn-doe,john\nli,li wei\n")
+    inner = zipped(tmp_path / f"{slug}-submissions.zip", files)
+    outer = folder(tmp_path / "clones", {f"{slug}-submissions/{name}": content for name, content in files.items()})
+    for number, download in enumerate((inner, outer, outer / f"{slug}-submissions")):
+        done = collect.collect([download], tmp_path / str(number), names=tmp_path / "names.csv")
+        assert papers(tmp_path / str(number)) == {("jane", "ch44"): ONE, ("john", "ch44"): TWO, ("li wei", "ch44"): THREE}
+        assert not done.problems
+    loose = folder(
+        tmp_path / "loose", {f"{name}/.git/HEAD".replace("/sub", ""): b"" for name in map(os.path.dirname, files)} | files
+    )
+    done = collect.collect([loose], into, names=tmp_path / "names.csv")
+    (line,) = [line for line in done.problems if "janedoe" in line]
+    assert line.count(f"{slug}-janedoe") == 3 and f"does not have {slug}-janedoe;" in line and "named SLUG-submissions" in line
+
+
 def test_nbgrader(tmp_path, into):
     files = {
         "jane/ch44/ch44.ipynb": ONE,
@@ -365,6 +383,39 @@ def test_names(tmp_path, into):
     done = collect.collect([zipped(tmp_path / "a.zip", CANVAS)], into, names=tmp_path / "names.csv")
     assert sorted(papers(into)) == [("jane", "ch44"), ("john", "ch44"), ("li", "ch44")]
     assert len(done.problems) == 1 and "--names does not have 12347, li; collected as li" in done.problems[0]
+
+
+def test_whoever_is_unknown_and_not_collected_is_not_said_to_be(tmp_path, into):
+    (tmp_path / "names.csv").write_text("id;student\n1;jane\n")
+    files = {"jane_1_5_ch44.ipynb": ONE, "jane_1_6_ch43.ipynb": ONE, "pdfonly_2_7_a.pdf": b"%PDF", "li_3_8_ch44.ipynb": TWO}
+    done = collect.collect([zipped(tmp_path / "a.zip", files)], into, names=tmp_path / "names.csv")
+    about = [line for line in done.problems if "pdfonly" in line]
+    assert sum("not collected" in line for line in about) == 1 and not any("collected as" in line for line in about)
+    assert any("--names does not have 3, li; collected as li" in line for line in done.problems)
+    metadata = "submission_1:\n  :submitters: []\nsubmission_2:\n  :submitters: []\n"
+    files = {"submission_metadata.yml": metadata.encode(), "submission_1/a.pdf": b"", "submission_2/ch44.ipynb": ONE}
+    files |= {"submission_2/ch43.ipynb": ONE}
+    done = collect.collect([zipped(tmp_path / "b.zip", files)], tmp_path / "other")
+    assert [("collected as" in line, line.partition(":")[0]) for line in done.problems if "does not say" in line] == [
+        (False, "submission_1"), (True, "submission_2"),
+    ]  # fmt: skip
+
+
+def test_archives_that_stay_closed_are_named_with_what_to_do(tmp_path, into):
+    inner = zipped(tmp_path / "i.zip", {"ch44.ipynb": ONE}).read_bytes()
+    deeper = zipped(tmp_path / "d.zip", {"inner.zip": inner}).read_bytes()
+    files = {
+        "a_1_5_ch44.ipynb": ONE,
+        "b_2_6_work.zip": deeper,
+        "c_3_7_work.tar.gz": b"",
+        "d_4_8_work.rar": b"",
+        "e_5_9_a.pdf": b"",
+    }
+    done = collect.collect([zipped(tmp_path / "a.zip", files)], into)
+    said = {line.partition("_")[0]: line for line in done.problems}
+    for who, name in (("b", "inner.zip"), ("c", "work.tar.gz"), ("d", "work.rar")):
+        assert f"unpack {name}" in said[who] and "collect again" in said[who]
+    assert "unpack" not in said["e"]
 
 
 @pytest.mark.parametrize(
