@@ -54,6 +54,7 @@ class Paper:
     attempt: Attempt
     files: dict[str, Entry]
     late: bool = False
+    kept: list[str] = field(default_factory=list)  # names of other notebooks that came with it, for the same assignment
 
 
 @dataclass
@@ -61,6 +62,7 @@ class Collected:
     """What was done: an entry for each submission that counts, and lines."""
 
     entries: list[dict[str, Any]] = field(default_factory=list)
+    kept: dict[tuple[str, str], list[str]] = field(default_factory=dict)  # (student, assignment) → notebooks that do not count
     problems: list[str] = field(default_factory=list)  # not understood
     notes: list[str] = field(default_factory=list)
 
@@ -119,6 +121,7 @@ def collect(
             raise CollectError(f"nothing was collected: {'; '.join(done.problems[:3])}")
         if dry_run:
             latest = {(one.attempt.student, one.attempt.assignment): one for one in papers}
+            done.kept = {key: one.kept for key, one in latest.items()}
             done.entries = [_entry(one.attempt, 1, rules, done, one.late) for _, one in sorted(latest.items())]
             return done
         into.mkdir(parents=True, exist_ok=True)
@@ -298,8 +301,10 @@ class _Sorting:
                 groups[name].append(entry)
         papers = []
         for name, candidates in groups.items():
+            every = candidates
             if one.platform == "canvas":  # a second upload of the same name is a later attempt, and the files' numbers grow
-                candidates.sort(key=lambda entry: int(entry.parts[0]))
+                own = [entry for entry in every if COPIED.sub("", NOTEBOOK.sub("", entry.name)).casefold() == name]
+                candidates = sorted(own or every, key=lambda entry: int(entry.parts[0]))
             else:
                 candidates = self._one_of(one, student, name, candidates)
             if not candidates:
@@ -308,8 +313,9 @@ class _Sorting:
                 others = [file for file in files if file not in candidates]
                 parent = entry.path.rpartition("/")[0]
                 paper = self._paper(one, student, name, self._beside(one, others, parent, name, entry))
+                paper.kept = [other.name for other in every if other is not entry]
                 if one.platform == "canvas":
-                    paper.attempt.order = int(entry.parts[0])
+                    paper.attempt.order, paper.attempt.download = int(entry.parts[0]), entry.shown
                 papers.append(paper)
         return papers
 
@@ -498,6 +504,7 @@ def _lay_out(
         if by_hand:
             done.notes.append(f"{'/'.join(key)}: what lay there is kept in {store.kept(key, have or '')}")
         store.put(key, winner, have)
+        done.kept[key] = next((paper.kept for paper in groups[key] if paper.attempt.sha256 == winner.sha256), [])
         entries[key] = _entry(winner, every.index(winner) + 1, rules, done, key in late)
     store.save()  # with the scores of --best
     done.entries = [entry for key, entry in sorted(entries.items()) if key in groups]
@@ -558,13 +565,15 @@ def grader(timeout: float) -> tuple[Judge, Callable[[], str]]:
 # --- for people --------------------------------------------------------------------------------------------------------------
 
 
-def table(entries: Collection[dict[str, Any]]) -> Table:
-    """Whose file was recognised as what."""
+def table(done: Collected) -> Table:
+    """Whose file was recognised as what, and which were kept beside it."""
     result = Table("Student", "Assignment", "From", "In the download", "Attempt", "Late")
     result.columns[3].overflow = "fold"  # whole names, for finding them
-    for entry in entries:
+    for entry in done.entries:
+        kept = done.kept.get((entry["student"], entry["assignment"]))
+        download = f"{entry['download']}; not {', '.join(kept)}" if kept else entry["download"]
         attempt = str(entry["attempt"]) + (f", {entry['submitted_at'][:16].replace('T', ' ')}" if entry["submitted_at"] else "")
-        cells = (entry["student"], entry["assignment"], entry["platform"], entry["download"], attempt, lateness(entry))
+        cells = (entry["student"], entry["assignment"], entry["platform"], download, attempt, lateness(entry))
         result.add_row(*(Text(clean_text(unicodedata.normalize("NFC", cell), 200)) for cell in cells))
     return result
 

@@ -66,6 +66,28 @@ def test_the_second_upload_to_canvas_is_a_later_attempt(tmp_path, into):
     assert sorted(os.path.basename(name) for name in kept) == ["ch44.ipynb", "helpers.py"] and ONE in kept.values()
 
 
+@pytest.mark.parametrize("other", ["ch44-old.ipynb", "gae.ipynb", "my ch44 scratch.ipynb"])
+def test_in_one_download_of_canvas_the_assignments_own_name_wins_over_another(tmp_path, into, other):
+    files = {
+        "doejane_1_9_ch44.ipynb": ONE,
+        f"doejane_1_10_{other}": notebook("2", ids=("compute_gae",)),
+        "li_2_3_ch44.ipynb": TWO,
+    }
+    zipped(tmp_path / "a.zip", files)
+    for more in (["--dry-run"], [], []):
+        shown = CliRunner().invoke(
+            cli.app, ["collect", str(tmp_path / "a.zip"), "--into", str(into), *more], env={"COLUMNS": "200"}
+        )
+        jane, li = [line for line in shown.output.splitlines() if "_ch44.ipynb" in line]
+        assert f"doejane_1_9_ch44.ipynb; not {other}" in jane and "not" not in li
+    assert papers(into) == {("doejane", "ch44"): ONE, ("li", "ch44"): TWO}
+    assert (into / "doejane" / "ch44" / other).exists()
+    later = {"doejane_1_10_ch44-1.ipynb": THREE, "doejane_1_11_ch44 (2).ipynb": TWO, "doejane_1_12_old ch44.ipynb": ONE}
+    done = collect.collect([zipped(tmp_path / "b.zip", later)], into)
+    assert papers(into)["doejane", "ch44"] == TWO and done.entries[0]["download"] == "doejane_1_11_ch44 (2).ipynb"
+    assert done.kept["doejane", "ch44"] == ["ch44-1.ipynb", "old ch44.ipynb"]
+
+
 def test_names_with_underscores_anonymous_students_and_text_entries_of_canvas(tmp_path, into):
     files = {
         "o_brien_77_5_ch44.ipynb": ONE,
