@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from autograder import cli
 from autograder.grading import intake
-from autograder.platforms import archives, attempts, collect
+from autograder.platforms import archives, attempts, collect, roster
 from tests.autograder.platforms.conftest import folder, notebook, tree, zipped
 
 ONE, TWO, THREE = notebook("1"), notebook("2"), notebook("3")
@@ -457,9 +457,32 @@ def test_platforms_own_lists_are_names_too(tmp_path, into, text):
     assert papers(into) == {("jane", "ch44"): ONE} and not done.problems
 
 
+@pytest.mark.parametrize("coding", ["utf-16", "utf-16-le", "utf-16-be", "utf-8", "utf-8-sig"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("first", ["", "sep=;\n", '"sep=;"\n', "SEP=\t\n"])
+def test_names_as_spreadsheets_write_them(tmp_path, into, coding, end, first):
+    between = "\t" if (coding.startswith("utf-16") and not first) or "\t" in first else ";"
+    text = first + between.join(("id", "student")) + "\n" + between.join(("12345", "Zoë, Ågren")) + "\n"
+    mark = "\ufeff" if coding[-3:] in ("-le", "-be") else ""
+    (tmp_path / "names.csv").write_bytes((mark + text.replace("\n", end)).encode(coding))
+    assert roster.load(tmp_path / "names.csv").student(id="12345") == "Zoë, Ågren"
+
+
+@pytest.mark.parametrize(
+    "content", ["id;student\n1;Zoë\n".encode("cp1252"), "id\tstudent\n1\tjo\n".encode("utf-16-le"), b"\xff\xfei"]
+)
+def test_names_in_another_coding_are_refused_with_how_to_save_them(tmp_path, into, content):
+    (tmp_path / "names.csv").write_bytes(content)
+    with pytest.raises(roster.RosterError, match="in Excel, save it as 'CSV UTF-8'"):
+        roster.load(tmp_path / "names.csv")
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
+        ("sep=;\nid;student\n1;jane\n1;li\n", "line 4: the id 1 is li's here and jane's in line 3"),
+        ("sep=,\nid,who\n1,jane\n", "line 2: the columns are id, who"),
+        ("id,student\n1," + "x" * 200_000 + "\n", "is no CSV that can be read (field larger"),
         ("id,student\n1,jane\n2,john\n1,li\n", "line 4: the id 1 is li's here and jane's in line 2; delete one of the two"),
         ("id,student\n1,\n", "line 2: no student in it"),
         ("id,who\n1,jane\n", "line 1: the columns are id, who; wanted are student and one of id, login, email, name"),
