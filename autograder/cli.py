@@ -180,7 +180,7 @@ def collect(
         _stop(f"{error}; collect again: what was handed in is kept", BROKEN)
     except OSError as error:
         _stop(f"the submissions cannot be written: {error}. What is written is whole; mend this and collect again.", BROKEN)
-    Console(highlight=False).print(collect.table(done.entries))
+    Console(highlight=False).print(collect.table(done))
     for line in done.notes:
         print(line)
     print(collect.summary(done, into, dry_run), flush=True)

@@ -12,7 +12,7 @@ import struct
 import tempfile
 import unicodedata
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,11 +39,15 @@ class Refused(ValueError):
 
 @dataclass(frozen=True)
 class Entry:
-    """One file of a download: its path with "/" between the parts, its size as far as known, and a way to read it."""
+    """One file of a download: its path with "/" between the parts, its size as far as known, and a way to read it.
+
+    `given` is its path in the download, where `path` is another.
+    """
 
     path: str
     size: int
     open: Callable[[], IO[bytes]]
+    given: str = ""
 
     @property
     def name(self) -> str:
@@ -55,7 +59,16 @@ class Entry:
 
     def under(self, prefix: str) -> Entry:
         """The same file, named from the folder `prefix` on."""
-        return Entry(self.path.removeprefix(prefix), self.size, self.open)
+        return self.renamed(self.path.removeprefix(prefix))
+
+    def renamed(self, path: str) -> Entry:
+        """The same file under another path."""
+        return Entry(path, self.size, self.open, self.shown)
+
+    @property
+    def shown(self) -> str:
+        """The path by which whoever has the download finds the file."""
+        return self.given or self.path
 
 
 def read(entry: Entry, limit: int = MAX_FILE) -> bytes:
@@ -81,21 +94,26 @@ def chunks(entry: Entry, limit: int = MAX_FILE) -> Iterator[bytes]:
         raise Refused(f"can't be unpacked ({type(error).__name__})") from None
 
 
-def entries(download: Path, stack: ExitStack, problems: list[str]) -> list[Entry]:
+def entries(
+    download: Path, stack: ExitStack, problems: list[str], named: Callable[[str], bool] = lambda name: False
+) -> list[Entry]:
     """The files of a folder or zip, sorted by path; a line in `problems` for each that is not taken.
+
+    What is hidden, or left by systems and editors, is passed over in silence, unless it is `named` as a platform names what a person
+    has handed in.
 
     Raises: Refused if there is no such download, or it is neither.
     """
     if download.is_dir():
-        found = list(_of_folder(download, problems))
+        found = list(_of_folder(download, problems, named))
     elif download.is_file():
-        found = of_zip(_opener(download), download.name, stack, problems)
+        found = of_zip(_opener(download), download.name, stack, problems, named=named)
     else:
         raise Refused("is neither a folder nor a zip: give what the platform let you download")
     return sorted(found, key=lambda entry: entry.path)
 
 
-def _of_folder(folder: Path, problems: list[str]) -> Iterator[Entry]:
+def _of_folder(folder: Path, problems: list[str], named: Callable[[str], bool]) -> Iterator[Entry]:
     waiting, seen = [""], 0
     while waiting:
         parent = waiting.pop()
@@ -105,6 +123,7 @@ def _of_folder(folder: Path, problems: list[str]) -> Iterator[Entry]:
         except OSError as error:
             problems.append(f"{_shown(parent)}: can't be read ({error.strerror})")
             continue
+        beside = {entry.name for entry in inside}
         for entry in inside:
             seen += 1
             if seen > MAX_ENTRIES:
@@ -113,7 +132,7 @@ def _of_folder(folder: Path, problems: list[str]) -> Iterator[Entry]:
             path = f"{parent}/{entry.name}" if parent else entry.name
             if entry.name == REPOSITORY:
                 yield Entry(f"{path}/HEAD", 0, _opener(Path(os.devnull)))
-            if is_junk(entry.name):
+            if _is_nobodys(entry.name, named, beside.__contains__):
                 continue
             if entry.is_dir(follow_symlinks=False):
                 if path.count("/") < MAX_DEPTH:
@@ -142,6 +161,7 @@ def of_zip(
     stack: ExitStack,
     problems: list[str],
     opener: Callable[[zipfile.ZipInfo], Callable[[], IO[bytes]]] | None = None,
+    named: Callable[[str], bool] = lambda name: False,
 ) -> list[Entry]:
     """The files of a zip that lies in a seekable stream, which `stack` keeps open, unless there is an `opener` of its members.
 
@@ -155,10 +175,11 @@ def of_zip(
     except Exception as error:  # a damaged directory may break it in any way
         raise Refused(f"is no zip that can be read ({error})") from None
     found: dict[str, Entry] = {}
+    names = {member.filename for member in members}
     told = 0
     for member in members:
         try:
-            path = _safe_path(member.filename)
+            path = _safe_path(member.filename, named, names)
             if member.is_dir() or path is None:
                 continue
             _check_member(member)
@@ -201,7 +222,7 @@ def _check_member(member: zipfile.ZipInfo) -> None:
         raise Refused("unpacks to more than two hundred times its size")
 
 
-def _safe_path(name: str) -> str | None:
+def _safe_path(name: str, named: Callable[[str], bool], names: Collection[str]) -> str | None:
     """A member's path in our notation; None for what is nobody's work. Raises: Refused if it leads elsewhere."""
     name = name.replace("\\", "/")
     parts = [part for part in name.split("/") if part not in ("", ".")]
@@ -211,11 +232,20 @@ def _safe_path(name: str) -> str | None:
         raise Refused(f"lies more than {MAX_DEPTH} folders deep, or has a name of more than {intake.MAX_PATH} bytes")
     if REPOSITORY in parts:
         return "/".join([*parts[: parts.index(REPOSITORY) + 1], "HEAD"])
-    if not parts or any(is_junk(part) for part in parts):
+    folder = name.rstrip("/").rpartition("/")[0]
+    if not parts or any(_is_nobodys(part, named, lambda twin: f"{folder}/{twin}".lstrip("/") in names) for part in parts):
         return None
     if any(_clean(part) != part for part in parts):
         raise Refused("has a name that can't be written down")
     return unicodedata.normalize("NFC", "/".join(parts))
+
+
+def _is_nobodys(name: str, named: Callable[[str], bool], there: Callable[[str], bool]) -> bool:
+    """Whether nobody has handed in a file of this name; `there` says of a name whether it lies in the same folder."""
+    if not is_junk(name):
+        return False
+    beside = name.startswith("~$") or (name.startswith("._") and there(name.removeprefix("._")))  # what Word and macOS write
+    return beside or not named(name)
 
 
 def _clean(name: str) -> str:
@@ -226,7 +256,7 @@ def _shown(name: str) -> str:
     return clean_text(name, 200).replace("\n", " ").replace("\t", " ")
 
 
-def nested(entry: Entry, stack: ExitStack, problems: list[str]) -> list[Entry]:
+def nested(entry: Entry, stack: ExitStack, problems: list[str], named: Callable[[str], bool] = lambda name: False) -> list[Entry]:
     """The files of a zip inside a download; zips in it stay closed. Raises: Refused.
 
     It is opened anew for each file: a class hands in more zips than a process may keep open.
@@ -235,5 +265,10 @@ def nested(entry: Entry, stack: ExitStack, problems: list[str]) -> list[Entry]:
     with open(path, "wb") as spool:
         for piece in chunks(entry):
             spool.write(piece)
+
+    def opener(member: zipfile.ZipInfo) -> Callable[[], IO[bytes]]:
+        return lambda: zipfile.ZipFile(path).open(member)
+
     with ExitStack() as own:
-        return of_zip(_opener(path), entry.path, own, problems, lambda member: lambda: zipfile.ZipFile(path).open(member))
+        inside = of_zip(_opener(path), entry.shown, own, problems, opener, named)
+    return [Entry(file.path, file.size, file.open, f"{entry.shown}/{file.path}") for file in inside]

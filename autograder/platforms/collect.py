@@ -38,6 +38,7 @@ from autograder.platforms.downloads import Handed
 COLLECTED = ".collected.json"
 SCHEMA = 1
 PEOPLES_IDS = ("canvas", "moodle")  # where an id is a person's, and names are what people are called
+ARCHIVE = re.compile(r"\.(?:zip|7z|rar|tar|tgz|tbz2?|txz|(?:tar\.)?(?:gz|bz2|xz|zst))$", re.I)
 NOTEBOOK = re.compile(r"\.ipynb(?:\.json|\.txt)?$", re.I)
 COPIED = re.compile(r"^copy of | ?\(\d+\)$|-\d+$|-copy\d*$|_\d+$", re.I)  # what systems add to a name that is taken
 
@@ -53,6 +54,7 @@ class Paper:
     attempt: Attempt
     files: dict[str, Entry]
     late: bool = False
+    kept: list[str] = field(default_factory=list)  # names of other notebooks that came with it, for the same assignment
 
 
 @dataclass
@@ -60,6 +62,7 @@ class Collected:
     """What was done: an entry for each submission that counts, and lines."""
 
     entries: list[dict[str, Any]] = field(default_factory=list)
+    kept: dict[tuple[str, str], list[str]] = field(default_factory=dict)  # (student, assignment) → notebooks that do not count
     problems: list[str] = field(default_factory=list)  # not understood
     notes: list[str] = field(default_factory=list)
 
@@ -118,6 +121,7 @@ def collect(
             raise CollectError(f"nothing was collected: {'; '.join(done.problems[:3])}")
         if dry_run:
             latest = {(one.attempt.student, one.attempt.assignment): one for one in papers}
+            done.kept = {key: one.kept for key, one in latest.items()}
             done.entries = [_entry(one.attempt, 1, rules, done, one.late) for _, one in sorted(latest.items())]
             return done
         into.mkdir(parents=True, exist_ok=True)
@@ -187,6 +191,7 @@ class _Sorting:
     before: dict[str, tuple[str, str | None]]
     stack: ExitStack
     done: Collected
+    strangers: dict[str, Handed] = field(default_factory=dict)  # person → what they handed in, where nothing says whose it is
 
     def papers(self, handed: Sequence[Handed], source: str) -> list[Paper]:
         labels = self._labels(handed)
@@ -194,8 +199,6 @@ class _Sorting:
         papers, without = [], []
         for one, files in opened:
             student = labels[one.person]
-            if one.unknown:
-                self.done.problems.append(f"{one.download}: {one.unknown}")
             found = self._of_one(one, student, files)
             papers += found
             if not found:
@@ -205,13 +208,18 @@ class _Sorting:
             named = self.assignment or one.assignment or (next(iter(common)) if len(common) == 1 else None)
             seen = ", ".join(entry.name for entry in files[:3]) or "nothing at all"
             notebook = any(NOTEBOOK.search(entry.name) for entry in files)
-            where = (
-                f"collected as it is, for {named}" if named and files else "not collected; --assignment says for which chapter"
-            )
+            packed = ", ".join(entry.name for entry in files if ARCHIVE.search(entry.name))
+            if named and files:
+                where = f"collected as it is, for {named}"
+            else:
+                where = "not collected" if packed or not files else "not collected; --assignment says for which chapter"
+            if packed:
+                where += f"; unpack {packed}, name the notebook as the download names its files, and collect again"
             what = "no notebook that one can tell to be of a chapter" if notebook else "no notebook"
             self.done.problems.append(f"{one.download}: {student} handed in {what} ({seen}); {where}")
             if named and files:
                 papers.append(self._paper(one, student, named, self._beside(one, files, "", named, None)))
+        self._tell_strangers(labels, {paper.attempt.student for paper in papers})
         if any(one.zoneless for one in handed):
             self.done.notes.append(
                 f"{source}: its times have no zone and are not used; a file with `zone: Europe/London`, given by --due, tells it"
@@ -245,10 +253,26 @@ class _Sorting:
                         f"{one.download}: --names has {mapped} for {first} and for {one.platform_id}, whose work is taken for attempts of"
                         " one person; if they are two, give each a student"
                     )
-            if self.people and not mapped and not one.unknown:
-                told = ", ".join(filter(None, (one.platform_id, one.login, one.email, one.name)))
-                self.done.problems.append(f"{one.download}: --names does not have {told}; collected as {default}")
+            if not mapped:
+                self.strangers[one.person] = one
         return labels
+
+    def _tell_strangers(self, labels: dict[str, str], collected: Collection[str]) -> None:
+        """Name whoever is in neither the download nor --names, and as whom their work was collected, if it was."""
+        for person, one in self.strangers.items():
+            under = f"; collected as {labels[person]}" if labels[person] in collected else ""
+            if one.unknown:
+                cure = f", until --names maps {one.platform_id or 'it'} to a student" if under else ""
+                self.done.problems.append(f"{one.download}: {one.unknown}{under}{cure}")
+            elif self.people:
+                told = ", ".join(dict.fromkeys(filter(None, (one.platform_id, one.login, one.email, one.name))))
+                cure = ""
+                if one.platform == "github" and one.login == one.platform_id:
+                    cure = (
+                        "; a folder around the clones that is named SLUG-submissions tells where in SLUG-LOGIN the login begins"
+                    )
+                self.done.problems.append(f"{one.download}: --names does not have {told}{under}{cure}")
+        self.strangers.clear()
 
     def _opened(self, one: Handed) -> list[Entry]:
         """A submission's files; of one without a notebook, those in its zips."""
@@ -263,9 +287,9 @@ class _Sorting:
             try:
                 inside = archives.nested(entry, self.stack, self.done.problems)
                 folder = f"{entry.path.rpartition('/')[0]}/".lstrip("/") if one.platform == "canvas" else ""
-                result += [Entry(folder + file.path, file.size, file.open) for file in inside if _is_work(file)]
+                result += [file.renamed(folder + file.path) for file in inside if _is_work(file)]
             except Refused as reason:
-                self.done.problems.append(f"{one.download}: {entry.name} {reason}")
+                self.done.problems.append(f"{entry.shown}: {reason}")
                 result.append(entry)
         return result
 
@@ -277,8 +301,10 @@ class _Sorting:
                 groups[name].append(entry)
         papers = []
         for name, candidates in groups.items():
+            every = candidates
             if one.platform == "canvas":  # a second upload of the same name is a later attempt, and the files' numbers grow
-                candidates.sort(key=lambda entry: int(entry.parts[0]))
+                own = [entry for entry in every if COPIED.sub("", NOTEBOOK.sub("", entry.name)).casefold() == name]
+                candidates = sorted(own or every, key=lambda entry: int(entry.parts[0]))
             else:
                 candidates = self._one_of(one, student, name, candidates)
             if not candidates:
@@ -287,8 +313,9 @@ class _Sorting:
                 others = [file for file in files if file not in candidates]
                 parent = entry.path.rpartition("/")[0]
                 paper = self._paper(one, student, name, self._beside(one, others, parent, name, entry))
+                paper.kept = [other.name for other in every if other is not entry]
                 if one.platform == "canvas":
-                    paper.attempt.order = int(entry.parts[0])
+                    paper.attempt.order, paper.attempt.download = int(entry.parts[0]), entry.shown
                 papers.append(paper)
         return papers
 
@@ -477,6 +504,7 @@ def _lay_out(
         if by_hand:
             done.notes.append(f"{'/'.join(key)}: what lay there is kept in {store.kept(key, have or '')}")
         store.put(key, winner, have)
+        done.kept[key] = next((paper.kept for paper in groups[key] if paper.attempt.sha256 == winner.sha256), [])
         entries[key] = _entry(winner, every.index(winner) + 1, rules, done, key in late)
     store.save()  # with the scores of --best
     done.entries = [entry for key, entry in sorted(entries.items()) if key in groups]
@@ -537,13 +565,15 @@ def grader(timeout: float) -> tuple[Judge, Callable[[], str]]:
 # --- for people --------------------------------------------------------------------------------------------------------------
 
 
-def table(entries: Collection[dict[str, Any]]) -> Table:
-    """Whose file was recognised as what."""
+def table(done: Collected) -> Table:
+    """Whose file was recognised as what, and which were kept beside it."""
     result = Table("Student", "Assignment", "From", "In the download", "Attempt", "Late")
     result.columns[3].overflow = "fold"  # whole names, for finding them
-    for entry in entries:
+    for entry in done.entries:
+        kept = done.kept.get((entry["student"], entry["assignment"]))
+        download = f"{entry['download']}; not {', '.join(kept)}" if kept else entry["download"]
         attempt = str(entry["attempt"]) + (f", {entry['submitted_at'][:16].replace('T', ' ')}" if entry["submitted_at"] else "")
-        cells = (entry["student"], entry["assignment"], entry["platform"], entry["download"], attempt, lateness(entry))
+        cells = (entry["student"], entry["assignment"], entry["platform"], download, attempt, lateness(entry))
         result.add_row(*(Text(clean_text(unicodedata.normalize("NFC", cell), 200)) for cell in cells))
     return result
 

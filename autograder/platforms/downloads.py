@@ -30,7 +30,7 @@ MAX_METADATA = 64 << 20
 MAX_TEXT = 1 << 20
 CANVAS = re.compile(r"(?:(?!LATE_)(?P<name>.+?)_)?(?P<late>LATE_)?(?P<id>\d+|anon_[^\W_]+)_(?P<file>\d+)_(?P<rest>.+)", re.S)
 CANVAS_TEXT = re.compile(r"(?:(?!LATE_)(?P<name>.+?)_)?(?P<late>LATE_)?(?P<id>\d+|anon_[^\W_]+)_(?P<rest>text|link)\.html", re.S)
-MOODLE = re.compile(r"(?P<name>[^_]+)(?:_(?P<id>\d+))?_assignsubmission_(?P<kind>[a-z]+)_(?P<rest>.*)", re.S)
+MOODLE = re.compile(r"(?P<name>.+?)(?:_(?P<id>\d+))?_assignsubmission_(?P<kind>[a-z]+)_(?P<rest>.*)", re.S)
 BLACKBOARD = re.compile(
     r"(?P<title>.*)_(?P<login>[^_]+(?:_[^_]+)*?)_[^\W\d_]+_(?P<at>\d{4}(?:-\d\d){5})(?:_(?P<rest>.+)|\.txt)", re.S
 )
@@ -38,6 +38,8 @@ GRADESCOPE = re.compile(r"submission_(\d+)")
 METADATA = "submission_metadata.yml"
 WANTED = (":submitters", ":created_at", ":name", ":sid", ":email")  # of its keys
 MAX_NESTING = 50
+SUBMISSIONS = re.compile(r"(.+)-submissions(?: ?\(\d+\)| \d+)?(?:\.zip)?", re.I | re.S)
+AGAIN = "; if it is somebody's work, rename it so and collect again"
 EXCHANGE = re.compile(r"(?P<student>[^+]+)\+(?P<assignment>[^+]+)\+(?P<at>[^+]+(?:\+\d{4})?)(?:\+.*)?")
 
 
@@ -79,7 +81,7 @@ class Found:
 
     def add(self, other: Found, prefix: str) -> None:
         self.handed += [replace(one, download=prefix + one.download) for one in other.handed]
-        self.problems += other.problems
+        self.problems += [prefix + line for line in other.problems]
         self.notes += other.notes
 
 
@@ -107,12 +109,17 @@ def read(
     Raises: archives.Refused, going on from the download's name.
     """
     found = Found()
-    files = archives.entries(download, stack, found.problems)
+    files = archives.entries(download, stack, found.problems, _is_named)
     if pattern:
         found.add(_by_pattern(files, pattern), "")
     else:
-        _recognise(files, "", found, stack, _Reading(known, zone, force))
+        _recognise(files, "", found, stack, _Reading(known, zone, force, download.resolve().name))
     return found
+
+
+def _is_named(name: str) -> bool:
+    """Whether a platform gives such a name to what somebody has handed in, which a person's name may begin with a dot."""
+    return any(naming.fullmatch(name) for naming in (CANVAS, CANVAS_TEXT, MOODLE, BLACKBOARD, EXCHANGE))
 
 
 @dataclass(frozen=True)
@@ -120,6 +127,16 @@ class _Reading:
     known: frozenset[str]
     zone: tzinfo | None
     force: str | None
+    folder: str  # the name of the folder or zip that is looked at
+
+    def of(self, folder: str) -> _Reading:
+        return replace(self, folder=folder)
+
+    @property
+    def slug(self) -> str | None:
+        """What the repositories in this folder begin with, before a dash and the login: GitHub Classroom clones into SLUG-submissions."""
+        match = SUBMISSIONS.fullmatch(self.folder)
+        return match[1].casefold() if match else None
 
 
 def _recognise(files: list[Entry], prefix: str, found: Found, stack: ExitStack, reading: _Reading, depth: int = 0) -> None:
@@ -131,12 +148,12 @@ def _recognise(files: list[Entry], prefix: str, found: Found, stack: ExitStack, 
             return
     for name, inside in level.items():
         if inside[0].path != name and depth < 4:
-            _recognise([entry.under(f"{name}/") for entry in inside], f"{prefix}{name}/", found, stack, reading, depth + 1)
+            files = [entry.under(f"{name}/") for entry in inside]
+            _recognise(files, f"{prefix}{name}/", found, stack, reading.of(name), depth + 1)
         elif inside[0].path == name and name.lower().endswith(".zip") and depth < 4 and not prefix.endswith(".zip/"):
             try:
-                _recognise(
-                    archives.nested(inside[0], stack, found.problems), f"{prefix}{name}/", found, stack, reading, depth + 1
-                )
+                files = archives.nested(inside[0], stack, found.problems, _is_named)
+                _recognise(files, f"{prefix}{name}/", found, stack, reading.of(name), depth + 1)
             except Refused as reason:
                 found.problems.append(f"{prefix}{name}: {reason}")
         elif name != REPOSITORY:
@@ -175,7 +192,7 @@ def _canvas(level: Level, reading: _Reading) -> Found:
         if match:
             units[match["id"]].append((match, inside[0]))
         else:
-            found.problems.append(f"{name}: is not named as Canvas names files (name_userid_fileid_filename)")
+            found.problems.append(f"{name}: is not named as Canvas names files (name_userid_fileid_filename){AGAIN}")
     for number, parts in units.items():
         parts.sort(key=lambda part: int(part[0].groupdict().get("file") or 0))
         match, first = parts[-1]
@@ -183,7 +200,7 @@ def _canvas(level: Level, reading: _Reading) -> Found:
         for one, entry in parts:
             rest = one["rest"] if "file" in one.groupdict() else f"{one['rest']}.html"
             order = max(order, int(one.groupdict().get("file") or 0))
-            files.append(Entry(f"{one.groupdict().get('file') or '0'}/{rest}", entry.size, entry.open))
+            files.append(entry.renamed(f"{one.groupdict().get('file') or '0'}/{rest}"))
         late = any(one["late"] for one, _ in parts)
         found.handed.append(Handed("canvas", tuple(files), first.path, number, match["name"], late=late, order=order))
     return found
@@ -203,7 +220,7 @@ def _moodle(level: Level, reading: _Reading) -> Found:
     for name, inside in level.items():
         match = MOODLE.fullmatch(name)
         if not match:
-            found.problems.append(f"{name}: is not named as Moodle names submissions (Name_id_assignsubmission_file_)")
+            found.problems.append(f"{name}: is not named as Moodle names submissions (Name_id_assignsubmission_file_){AGAIN}")
             continue
         key = (match["name"], match["id"])
         if match["kind"] == "file" or key not in folders:
@@ -211,7 +228,7 @@ def _moodle(level: Level, reading: _Reading) -> Found:
         for entry in inside:
             units[key].append((match["rest"] if _is_file(name, inside) else entry.path.removeprefix(f"{name}/"), entry))
     for (who, number), parts in units.items():
-        files = tuple(Entry(path, entry.size, entry.open) for path, entry in parts)
+        files = tuple(entry.renamed(path) for path, entry in parts)
         found.handed.append(Handed("moodle", files, folders[who, number], number, who))
     return found
 
@@ -231,7 +248,7 @@ def _gradescope(level: Level, reading: _Reading) -> Found:
             continue
         match = GRADESCOPE.fullmatch(name.partition(".")[0])
         if not match and name not in metadata:
-            found.problems.append(f"{name}: is not named as Gradescope names submissions (submission_ID)")
+            found.problems.append(f"{name}: is not named as Gradescope names submissions (submission_ID){AGAIN}")
             continue
         files = tuple(inside if _is_file(name, inside) else (entry.under(f"{name}/") for entry in inside))
         one = _mapping(metadata.get(name))
@@ -245,7 +262,7 @@ def _gradescope(level: Level, reading: _Reading) -> Found:
                 replace(base, name=_text(person.get(":name")), login=sid or (email or "").partition("@")[0] or None, email=email)
             )
         if not people:
-            unknown = f"{METADATA} does not say whose it is; collected under this name, until --names maps {base.platform_id} to a student"
+            unknown = f"{METADATA} does not say whose it is"
             found.handed.append(replace(base, unknown=unknown))
     return found
 
@@ -327,12 +344,14 @@ def _blackboard(level: Level, reading: _Reading) -> Found:
         if match:
             units[logins[name], match["at"]].append((match, inside[0]))
         else:
-            found.problems.append(f"{name}: is not named as Blackboard names files (Assignment_login_attempt_time_filename)")
+            found.problems.append(
+                f"{name}: is not named as Blackboard names files (Assignment_login_attempt_time_filename){AGAIN}"
+            )
     for (login, at), parts in units.items():
-        files = tuple(Entry(match["rest"], entry.size, entry.open) for match, entry in parts if match["rest"])
+        files = tuple(entry.renamed(match["rest"]) for match, entry in parts if match["rest"])
         told = next((entry for match, entry in parts if not match["rest"]), None)
         if told and not files:  # what was typed into Blackboard is all that there is
-            files = (Entry("submission.txt", told.size, told.open),)
+            files = (told.renamed("submission.txt"),)
         moment = datetime.strptime(at, "%Y-%m-%d-%H-%M-%S") if _is_date(at) else None
         aware = moment.replace(tzinfo=reading.zone) if moment and reading.zone else None
         shown = next((entry.path for match, entry in parts if match["rest"]), parts[0][1].path)
@@ -379,15 +398,18 @@ def _blackboard_name(told: Entry | None, login: str) -> str | None:
 
 def _fits_github(level: Level, reading: _Reading) -> bool:
     folders = [name for name, inside in level.items() if not _is_file(name, inside)]
-    return any(_is_repository(level[name]) and REPOSITORY in {entry.parts[1] for entry in level[name]} for name in folders) or (
-        bool(folders) and all(_repository_login(name, reading.known)[1] for name in folders)
-    )
+    if any(_is_repository(level[name]) and REPOSITORY in {entry.parts[1] for entry in level[name]} for name in folders):
+        return True
+    told = [_repository_login(name, reading)[1] for name in folders]
+    return any(told) if reading.slug else bool(told) and all(told)
 
 
-def _repository_login(name: str, known: frozenset[str]) -> tuple[str | None, str | None]:
-    """(assignment, login) of a repository that is named `ch44-janedoe`."""
+def _repository_login(name: str, reading: _Reading) -> tuple[str | None, str | None]:
+    """(assignment, login) of a repository that is named `ch44-janedoe`, or as the folder around it says."""
+    if reading.slug and name.casefold().startswith(f"{reading.slug}-"):
+        return in_name(reading.slug, reading.known), name[len(reading.slug) + 1 :] or None
     head, _, login = name.partition("-")
-    return (head.lower(), login) if head.lower() in known and login else (None, None)
+    return (head.lower(), login) if head.lower() in reading.known and login else (None, None)
 
 
 def _github(level: Level, reading: _Reading) -> Found:
@@ -396,7 +418,7 @@ def _github(level: Level, reading: _Reading) -> Found:
         if _is_file(name, inside):
             found.problems.append(f"{name}: lies beside the clones, in none of them")
             continue
-        assignment, login = _repository_login(name, reading.known)
+        assignment, login = _repository_login(name, reading)
         files = tuple(entry.under(f"{name}/") for entry in inside if REPOSITORY not in entry.parts)
         found.handed.append(Handed("github", files, name, name, None, login or name, assignment=assignment))
     return found
@@ -464,7 +486,7 @@ def _by_pattern(files: list[Entry], pattern: re.Pattern[str]) -> Found:
     for (student, stamp), members in units.items():
         parts = members[-1][0]
         name = " ".join(filter(None, (parts.get("first_name"), parts.get("last_name")))) or None
-        renamed = tuple(Entry(_named(one["file_id"], entry.name), entry.size, entry.open) for one, entry in members)
+        renamed = tuple(entry.renamed(_named(one["file_id"], entry.name)) for one, entry in members)
         written = re.sub(r"(\d{4}-\d\d-\d\d)-(\d\d)-(\d\d)-(\d\d)", r"\1 \2:\3:\4", stamp)
         at = _time(written)
         order = int(re.sub(r"\D", "", stamp) or 0)

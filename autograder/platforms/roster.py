@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
 import re
@@ -31,6 +32,7 @@ COLUMNS = {
 }
 KEYS = ("id", "login", "email", "name")
 MAX_BYTES = 16 << 20
+SEPARATOR = re.compile(r"[\"']?sep=([,;\t|])[\"',;\s]*$", re.I)  # the line that tells Excel what stands between columns
 
 
 class RosterError(ValueError):
@@ -67,21 +69,36 @@ def load(path: Path) -> Roster:
         content = path.read_bytes()
     except OSError as error:
         raise RosterError(f"{path}: {error.strerror}; --names wants a CSV file") from None
+    text = _text(content[:MAX_BYTES])
+    if text is None:
+        raise RosterError(
+            f"{path}: is not UTF-8 text; in Excel, save it as 'CSV UTF-8', in LibreOffice as CSV with the character set Unicode (UTF-8)"
+        )
+    first, _, rest = text.partition("\n")
+    told = SEPARATOR.match(first)
+    delimiter = told[1] if told else max(",;\t", key=first.count)
     try:
-        text = content[:MAX_BYTES].decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise RosterError(f"{path}: is not UTF-8 text; export it as CSV, UTF-8") from None
-    first = text.partition("\n")[0]
-    delimiter = max(",;\t", key=first.count)
-    rows = list(csv.reader(io.StringIO(text), delimiter=delimiter))
+        rows = list(csv.reader(io.StringIO(rest if told else text), delimiter=delimiter))
+    except csv.Error as error:
+        raise RosterError(f"{path}: is no CSV that can be read ({error}); save it anew") from None
+    header = 2 if told else 1
     if not rows:
         raise RosterError(f"{path}: is empty; its first line names the columns: student and one of {', '.join(KEYS)}")
     kinds = _kinds(rows[0])
     if "student" not in kinds or not set(kinds) & set(KEYS):
         raise RosterError(
-            f"{path}, line 1: the columns are {', '.join(rows[0]) or 'none'}; wanted are student and one of {', '.join(KEYS)}"
+            f"{path}, line {header}: the columns are {', '.join(rows[0]) or 'none'}; wanted are student and one of {', '.join(KEYS)}"
         )
-    return _filled(path, kinds, rows)
+    return _filled(path, kinds, rows, header + 1)
+
+
+def _text(content: bytes) -> str | None:
+    """Of a table as UTF-8, or as Excel's "Unicode text", which is UTF-16 with a mark; None if it is neither."""
+    try:
+        text = content.decode("utf-16" if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig")
+    except UnicodeDecodeError:
+        return None
+    return None if "\0" in text else text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def _kinds(header: list[str]) -> list[str | None]:
@@ -100,11 +117,11 @@ def _kinds(header: list[str]) -> list[str | None]:
     return [COLUMNS.get(name) for name in names]
 
 
-def _filled(path: Path, kinds: list[str | None], rows: list[list[str]]) -> Roster:
+def _filled(path: Path, kinds: list[str | None], rows: list[list[str]], first: int) -> Roster:
     roster = Roster()
     lines: dict[tuple[str, str], int] = {}
     repeated = set()
-    for number, row in enumerate(rows[1:], start=2):
+    for number, row in enumerate(rows[1:], start=first):
         values = {kind: value.strip() for kind, value in zip(kinds, row, strict=False) if kind and value.strip()}
         if not values or row[0].strip() == "Points Possible":
             continue
@@ -118,7 +135,7 @@ def _filled(path: Path, kinds: list[str | None], rows: list[list[str]]) -> Roste
         for kind in KEYS:
             if kind not in values:
                 continue
-            value = re.sub(r"(?i)^participant ", "", values[kind]) if kind == "id" else values[kind]
+            value = re.sub(r"^[^\d\W][^\d]*\s(?=\d+$)", "", values[kind]) if kind == "id" else values[kind]
             key = (kind, _key(value))
             if roster.students.setdefault(key, student) != student:
                 if kind == "name":  # two people of one name: that tells nothing about either

@@ -1,5 +1,5 @@
 // The editor of an answer: CodeMirror, in the colours of the page's other code, whose class names its tokens get.
-import {defaultKeymap, history, historyKeymap, indentWithTab} from "@codemirror/commands";
+import {defaultKeymap, history, historyKeymap, indentWithTab, isolateHistory} from "@codemirror/commands";
 import {pythonLanguage} from "@codemirror/lang-python";
 import {bracketMatching, indentOnInput, indentUnit, syntaxHighlighting, HighlightStyle} from "@codemirror/language";
 import {EditorState, Prec} from "@codemirror/state";
@@ -47,6 +47,9 @@ window.coursePracticeEditor = ({parent, text, label, help, changed, check}) => {
   return {
     focus: () => view.focus(),
     text: () => view.state.doc.toString(),
-    replace: (text) => view.dispatch({changes: {from: 0, to: view.state.doc.length, insert: text}}),
+    replace: (text) => view.dispatch({
+      changes: {from: 0, to: view.state.doc.length, insert: text},
+      annotations: isolateHistory.of("full"), // one step to undo
+    }),
   };
 };

@@ -5,11 +5,12 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.abc
 import importlib.machinery
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -28,9 +29,19 @@ PACKAGES = (
         "pyarrow",
         "huggingface_hub",
     ),
+    *("_multiprocessing", "sqlite3", "tkinter", "curses"),  # Python's own, which are not in every Python
     *("threadpoolctl", "IPython", "ipywidgets", "seaborn", "tqdm", "einops", "jax", "vaderSentiment", "course_lib", "torch"),
 )
 """What a notebook of the course may import; of any other name Python says that there is no such module, as it does there."""
+
+SYSTEM = {
+    "builtins": {"input": "input", "breakpoint": "breakpoint"},
+    "threading": {"Thread.start": "threading.Thread"},
+    "_thread": {"start_new_thread": "_thread.start_new_thread"},
+    "subprocess": {"Popen.__init__": "subprocess.Popen"},
+    "os": {"system": "os.system", "popen": "os.popen", "fork": "os.fork"},
+}
+"""What Python asks the system for, which a page can't give: by module, where it stands and what it is called."""
 
 NUMBERS = {"pi": math.pi, "e": math.e, "inf": math.inf, "nan": math.nan, "newaxis": None}
 
@@ -80,7 +91,7 @@ class _Module(ModuleType):
             return NUMBERS[name]
         if package == "torch":
             return stand_in(f"{self.__name__}.{name}", "the page's torch")
-        return stand_in(f"{self.__name__}.{name}" if package == "course_lib" else package)
+        return stand_in(f"{self.__name__}.{name}" if package == "course_lib" else package.lstrip("_"))
 
 
 class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
@@ -96,7 +107,20 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         """There is nothing in it."""
 
 
+def _refused(what: str) -> Callable:
+    def function(*_args: Any, **_kwargs: Any) -> Any:
+        raise missing.Missing(what, "the page")
+
+    return function
+
+
 def install() -> None:
-    """From now on, what is imported and not found is stood in for, if it is one of PACKAGES."""
-    if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
-        sys.meta_path.append(_Finder())
+    """From now on, what is imported and not found is stood in for, if it is one of PACKAGES, and SYSTEM is refused in our words."""
+    if any(isinstance(finder, _Finder) for finder in sys.meta_path):
+        return
+    for module, names in SYSTEM.items():
+        for place, what in names.items():
+            owner, _, name = place.rpartition(".")
+            found = importlib.import_module(module)
+            setattr(getattr(found, owner) if owner else found, name, _refused(what))
+    sys.meta_path.append(_Finder())

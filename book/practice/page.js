@@ -112,9 +112,15 @@ function Answer(cell, name) {
     figures.forEach((figure) => figure.again());
   }
 
+  function follow() {
+    const kept = store.draft(name) ?? stub;
+    if (editor && editor.text() !== kept) editor.replace(kept);
+    else if (!editor && kept !== stub) open(false);
+  }
+
   code.addEventListener("click", () => { if (!editor && getSelection().isCollapsed) open(true); });
   if (store.draft(name) !== null) open(false);
-  return {replace, stub};
+  return {replace, follow, stub};
 }
 
 // The verdict as the notebook shows it, whose words come with it.
@@ -151,7 +157,14 @@ if (answers.size) {
   (title.parentElement.querySelector(":scope > ul") ?? title).after(panel);
 }
 progress();
-addEventListener("storage", progress);
+addEventListener("storage", follow);
+addEventListener("pageshow", ({persisted}) => persisted && follow());
+
+// Tabs of one page show one text: what is written in one is in the others at once, and a tab that slept is told when it wakes.
+function follow() {
+  answers.forEach((answer) => answer.follow());
+  progress();
+}
 
 function progress() {
   const done = [...answers.keys()].filter((name) => store.passed(name)).length;

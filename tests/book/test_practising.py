@@ -72,6 +72,22 @@ def told(page) -> str:
     return box.inner_text()
 
 
+def test_two_tabs_of_a_page_show_one_text(browser, html, name):
+    """Neither writes over what the other has not shown; what came from the other tab is one step to undo."""
+    with Visit(browser, html / f"{PAGE}.html") as visit:
+        one, two = visit.page, visit.context.new_page()
+        two.goto(one.url)
+        two.wait_for_function("window.coursePractice?.exercises.length")
+        shown = "text => document.querySelector('.tag_exercise-compute_gae .cm-content')?.innerText.trim() === text"
+        for page, other, text in ((one, two, "a = 1"), (two, one, "a = 12"), (one, two, "a = 123")):
+            write(page, text)
+            other.wait_for_function(shown, arg=text)
+        two.get_by_role("textbox", name="Your answer to compute_gae").focus()
+        two.keyboard.press("ControlOrMeta+z")
+        two.wait_for_function(shown, arg="a = 12")
+        one.wait_for_function(shown, arg="a = 12")
+
+
 def test_before_the_first_click_a_page_loads_little_more(visit, html, name):
     own = {Path(url.removeprefix("file://").partition("?")[0]) for url in visit.requests if "practice" in url}
     assert {path.name for path in own} == {"practice.js", "practice.css"}

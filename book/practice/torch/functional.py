@@ -192,10 +192,15 @@ def cross_entropy(
 ) -> Tensor:
     if weight is not None:
         raise Missing("torch.nn.functional.cross_entropy with weight=")
+    _target_only("cross_entropy_loss", target)
+    if target.shape == input.shape and not target.dtype.is_floating_point:
+        raise RuntimeError(f"Expected floating point type for target with class probabilities, got {target.dtype.long_name}")
     axis = 0 if input.ndim == 1 else 1
     logps = log_softmax(input, axis)
     classes = input.shape[axis]
-    if target.dtype.is_floating_point:
+    if target.shape == input.shape:
+        if ignore_index >= 0:
+            raise RuntimeError("ignore_index is not supported for floating point target")
         smooth = target * (1 - label_smoothing) + label_smoothing / classes if label_smoothing else target
         losses = -(logps * smooth).sum(axis)
         return _reduced(losses, reduction) if reduction != "mean" else losses.sum() / losses.numel()
@@ -208,10 +213,35 @@ def cross_entropy(
     return (1 - label_smoothing) * losses + label_smoothing / classes * spread
 
 
+def _target_only(name: str, target: Any) -> None:
+    if not isinstance(target, Tensor):
+        raise TypeError(f"{name}(): argument 'target' (position 2) must be Tensor, not {type(target).__name__}")
+
+
 def nll_loss(input: Tensor, target: Tensor, weight: Any = None, ignore_index: int = -100, reduction: str = "mean") -> Tensor:
+    if weight is not None:
+        raise Missing("torch.nn.functional.nll_loss with weight=")
+    _target_only("nll_loss_nd", target)
+    if not input.ndim:
+        raise ValueError("Expected 1 or more dimensions (got 0)")
+    if input.ndim > 1 and target.shape[:1] != input.shape[:1]:
+        sizes = f"({input.shape[0]}) to match target batch_size ({target.shape[0] if target.ndim else 0})"
+        raise ValueError(f"Expected input batch_size {sizes}.")
+    if target.dtype not in (dtypes.int64, dtypes.BY_NAME.get("uint8")):
+        raise RuntimeError(f"expected target dtype to be Long or Byte, but got {target.dtype.long_name}")
+    floats_only("nll_loss_out_frame", input.dtype)
+    target = target.to(dtypes.int64)
     axis = 0 if input.ndim == 1 else 1
     if input.ndim == 1 and target.ndim == 1 and target.shape == (1,):
         target = target.reshape(())
+    asked = [size for place, size in enumerate(input.shape) if place != axis]
+    if input.ndim > 2 and list(target.shape) != asked:
+        raise RuntimeError(f"Expected target size {asked}, got {list(target.shape)}")
+    if target.ndim != input.ndim - 1:
+        raise RuntimeError("0D or 1D target tensor expected, multi-target not supported")
+    beyond = [entry for entry in target.flat() if entry != ignore_index and not 0 <= entry < input.shape[axis]]
+    if beyond:
+        raise IndexError(f"Target {beyond[0]} is out of bounds.")
     kept: Any = target != ignore_index
     index = where(kept, target, 0)
     losses = where(kept, -input.gather(axis, index.unsqueeze(axis)).squeeze(axis), 0.0)

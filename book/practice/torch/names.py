@@ -63,11 +63,25 @@ def _found(table: dict[ModuleType, str]) -> dict[str, Callable]:
     return {name: getattr(module, own or name) for module, (name, _, own) in pairs}
 
 
+_MAY_BE_NONE = {"stable"}
+
+
+def _flags(function: Callable) -> dict[str, int]:
+    """The arguments that torch takes no number for, and their places; one that has no place is as good as never reached."""
+    parameters = inspect.signature(function).parameters.values()
+    return {
+        one.name: place if one.kind is one.POSITIONAL_OR_KEYWORD else len(parameters) + 1_000
+        for place, one in enumerate(parameters)
+        if one.annotation in (bool, "bool") or one.name == "unbiased"
+    }
+
+
 def _public(owner: str, name: str, function: Callable) -> Callable:
     """The function under torch's name, taking what else torch calls its arguments, and speaking up about those that it does not have."""
     parameters = inspect.signature(function).parameters
     first = next(iter(parameters.values()), None)
     needs_tensor = first is not None and first.name == "input" and first.annotation == "Tensor"
+    flags = {} if owner == "torch.nn.functional" else _flags(function)
     takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
 
     @functools.wraps(function)
@@ -87,6 +101,11 @@ def _public(owner: str, name: str, function: Callable) -> Callable:
                 raise TypeError(f"{name}() got an unexpected keyword argument '{word}'")
         if needs_tensor and args and not isinstance(args[0], Tensor):
             raise TypeError(f"{name}(): argument 'input' (position 1) must be Tensor, not {type(args[0]).__name__}")
+        for flag, place in flags.items():
+            value = kwargs.get(flag, args[place] if place < len(args) else False)
+            if not isinstance(value, bool) and not (value is None and flag in _MAY_BE_NONE):
+                where = "" if flag in kwargs else f" (position {place if owner == 'Tensor' else place + 1})"
+                raise TypeError(f"{name}(): argument '{flag}'{where} must be bool, not {type(value).__name__}")
         return function(*args, **kwargs)
 
     public.__name__ = public.__qualname__ = name

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from autograder import cli
 from autograder.grading import intake
-from autograder.platforms import archives, attempts, collect
+from autograder.platforms import archives, attempts, collect, roster
 from tests.autograder.platforms.conftest import folder, notebook, tree, zipped
 
 ONE, TWO, THREE = notebook("1"), notebook("2"), notebook("3")
@@ -66,6 +66,28 @@ def test_the_second_upload_to_canvas_is_a_later_attempt(tmp_path, into):
     assert sorted(os.path.basename(name) for name in kept) == ["ch44.ipynb", "helpers.py"] and ONE in kept.values()
 
 
+@pytest.mark.parametrize("other", ["ch44-old.ipynb", "gae.ipynb", "my ch44 scratch.ipynb"])
+def test_in_one_download_of_canvas_the_assignments_own_name_wins_over_another(tmp_path, into, other):
+    files = {
+        "doejane_1_9_ch44.ipynb": ONE,
+        f"doejane_1_10_{other}": notebook("2", ids=("compute_gae",)),
+        "li_2_3_ch44.ipynb": TWO,
+    }
+    zipped(tmp_path / "a.zip", files)
+    for more in (["--dry-run"], [], []):
+        shown = CliRunner().invoke(
+            cli.app, ["collect", str(tmp_path / "a.zip"), "--into", str(into), *more], env={"COLUMNS": "200"}
+        )
+        jane, li = [line for line in shown.output.splitlines() if "_ch44.ipynb" in line]
+        assert f"doejane_1_9_ch44.ipynb; not {other}" in jane and "not" not in li
+    assert papers(into) == {("doejane", "ch44"): ONE, ("li", "ch44"): TWO}
+    assert (into / "doejane" / "ch44" / other).exists()
+    later = {"doejane_1_10_ch44-1.ipynb": THREE, "doejane_1_11_ch44 (2).ipynb": TWO, "doejane_1_12_old ch44.ipynb": ONE}
+    done = collect.collect([zipped(tmp_path / "b.zip", later)], into)
+    assert papers(into)["doejane", "ch44"] == TWO and done.entries[0]["download"] == "doejane_1_11_ch44 (2).ipynb"
+    assert done.kept["doejane", "ch44"] == ["ch44-1.ipynb", "old ch44.ipynb"]
+
+
 def test_names_with_underscores_anonymous_students_and_text_entries_of_canvas(tmp_path, into):
     files = {
         "o_brien_77_5_ch44.ipynb": ONE,
@@ -78,6 +100,33 @@ def test_names_with_underscores_anonymous_students_and_text_entries_of_canvas(tm
         ("o_brien", "ch44"): ONE, ("anon_x1Y2z", "ch44"): TWO, ("anon_q9", "ch44"): THREE, ("poe", "ch44"): None,
     }  # fmt: skip
     assert len(done.problems) == 1 and "poe handed in no notebook (text.html)" in done.problems[0]
+
+
+@pytest.mark.parametrize("made", [zipped, folder])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "..hidden_121_7023_ch44.ipynb",
+        "._121_7023_ch44.ipynb",
+        ".._9_assignsubmission_file_/ch44.ipynb",
+        ".jo_9_assignsubmission_file_ch44.ipynb",
+        ".GAE_jo_attempt_2026-11-20-12-30-00_ch44.ipynb",
+        ".jo+ch44+2026-11-20 10:00:00.000000 UTC+x/ch44.ipynb",
+    ],
+)
+def test_a_person_whose_name_begins_with_a_dot_is_not_overlooked(tmp_path, into, made, name):
+    collect.collect([made(tmp_path / "download", {name: ONE})], into)
+    assert list(papers(into).values()) == [ONE]
+    zipped(tmp_path / "inner.zip", {name: ONE})
+    collect.collect([made(tmp_path / "all", {"inner.zip": (tmp_path / "inner.zip").read_bytes()})], tmp_path / "more")
+    assert list(papers(tmp_path / "more").values()) == [ONE]
+
+
+@pytest.mark.parametrize("made", [zipped, folder])
+def test_what_systems_and_editors_write_beside_is_nobodys(tmp_path, into, made):
+    left = ("._doejane_12345_678901_ch44.ipynb", "__MACOSX/._li_1_2_ch44.ipynb", "~$ejane_12345_678901_a.docx", ".DS_Store")
+    done = collect.collect([made(tmp_path / "download", CANVAS | dict.fromkeys(left, b"x"))], into)
+    assert len(papers(into)) == 3 and not done.problems
 
 
 def test_two_people_of_one_name_are_two_students_whenever_they_hand_in(tmp_path, into):
@@ -102,6 +151,30 @@ def test_moodle_in_both_forms(tmp_path, into, made):
     flat = {"Zoë Ågren_5_assignsubmission_file_ch44.ipynb": TWO, "Default group_assignsubmission_file_ch44.ipynb": ONE}
     done = collect.collect([made(tmp_path / "flat", flat)], into)
     assert papers(into)[("Zoë Ågren", "ch44")] == TWO and by_student(done)["Default group"]["platform_id"] is None
+
+
+@pytest.mark.parametrize("made", [zipped, folder])
+def test_underscores_in_what_moodle_calls_a_person(tmp_path, into, made):
+    files = {
+        "Teilnehmer_in 9006_9006_assignsubmission_file_/ch44.ipynb": ONE,
+        "Jo_7_8_assignsubmission_file_/a_assignsubmission_file_b.py": b"",
+        "Jo_7_8_assignsubmission_file_/ch44.ipynb": TWO,
+        "Group_A_assignsubmission_file_/ch44.ipynb": THREE,
+    }
+    (tmp_path / "names.csv").write_text("Participant,Student\nTeilnehmer/in 9006,jane\n8,jo\n")
+    done = collect.collect([made(tmp_path / "moodle", files)], into, names=tmp_path / "names.csv")
+    assert papers(into) == {("jane", "ch44"): ONE, ("jo", "ch44"): TWO, ("Group_A", "ch44"): THREE}
+    assert by_student(done)["jo"]["name"] == "Jo_7" and by_student(done)["Group_A"]["platform_id"] is None
+    assert len(done.problems) == 1 and "Group_A" in done.problems[0]
+    flat = {"Ab_c_9_assignsubmission_file_ch44_1_assignsubmission_file_.ipynb": ONE}
+    done = collect.collect([made(tmp_path / "flat", flat)], tmp_path / "more")
+    assert [(one["name"], one["platform_id"]) for one in done.entries] == [("Ab_c", "9")]
+
+
+def test_a_file_that_no_platform_names_so_is_told_with_a_cure(tmp_path, into):
+    files = {"Jane_1_assignsubmission_file_/ch44.ipynb": ONE, "stray/ch44.ipynb": TWO}
+    done = collect.collect([folder(tmp_path / "a", files)], into)
+    assert len(done.problems) == 1 and "rename it so and collect again" in done.problems[0]
 
 
 def test_a_zip_for_each_student_is_opened_and_a_zip_in_that_is_not(tmp_path, into):
@@ -215,6 +288,24 @@ def test_github(tmp_path, into):
     assert sorted(tree(into / "li")) == ["ch44/ch44.ipynb", "ch44/mine/more.py"]
 
 
+@pytest.mark.parametrize("slug", ["hw-ch44", "my-class-GAE"])
+def test_github_classrooms_folder_says_what_repositories_begin_with(tmp_path, into, slug):
+    files = {f"{slug}-janedoe/ch44.ipynb": ONE, f"{slug}-john-doe/sub/ch44.ipynb": TWO, f"{slug.lower()}-li/ch44.ipynb": THREE}
+    (tmp_path / "names.csv").write_text("login,student\njanedoe,jane\njohn-doe,john\nli,li wei\n")
+    inner = zipped(tmp_path / f"{slug}-submissions.zip", files)
+    outer = folder(tmp_path / "clones", {f"{slug}-submissions/{name}": content for name, content in files.items()})
+    for number, download in enumerate((inner, outer, outer / f"{slug}-submissions")):
+        done = collect.collect([download], tmp_path / str(number), names=tmp_path / "names.csv")
+        assert papers(tmp_path / str(number)) == {("jane", "ch44"): ONE, ("john", "ch44"): TWO, ("li wei", "ch44"): THREE}
+        assert not done.problems
+    loose = folder(
+        tmp_path / "loose", {f"{name}/.git/HEAD".replace("/sub", ""): b"" for name in map(os.path.dirname, files)} | files
+    )
+    done = collect.collect([loose], into, names=tmp_path / "names.csv")
+    (line,) = [line for line in done.problems if "janedoe" in line]
+    assert line.count(f"{slug}-janedoe") == 3 and f"does not have {slug}-janedoe;" in line and "named SLUG-submissions" in line
+
+
 def test_nbgrader(tmp_path, into):
     files = {
         "jane/ch44/ch44.ipynb": ONE,
@@ -316,6 +407,39 @@ def test_names(tmp_path, into):
     assert len(done.problems) == 1 and "--names does not have 12347, li; collected as li" in done.problems[0]
 
 
+def test_whoever_is_unknown_and_not_collected_is_not_said_to_be(tmp_path, into):
+    (tmp_path / "names.csv").write_text("id;student\n1;jane\n")
+    files = {"jane_1_5_ch44.ipynb": ONE, "jane_1_6_ch43.ipynb": ONE, "pdfonly_2_7_a.pdf": b"%PDF", "li_3_8_ch44.ipynb": TWO}
+    done = collect.collect([zipped(tmp_path / "a.zip", files)], into, names=tmp_path / "names.csv")
+    about = [line for line in done.problems if "pdfonly" in line]
+    assert sum("not collected" in line for line in about) == 1 and not any("collected as" in line for line in about)
+    assert any("--names does not have 3, li; collected as li" in line for line in done.problems)
+    metadata = "submission_1:\n  :submitters: []\nsubmission_2:\n  :submitters: []\n"
+    files = {"submission_metadata.yml": metadata.encode(), "submission_1/a.pdf": b"", "submission_2/ch44.ipynb": ONE}
+    files |= {"submission_2/ch43.ipynb": ONE}
+    done = collect.collect([zipped(tmp_path / "b.zip", files)], tmp_path / "other")
+    assert [("collected as" in line, line.partition(":")[0]) for line in done.problems if "does not say" in line] == [
+        (False, "submission_1"), (True, "submission_2"),
+    ]  # fmt: skip
+
+
+def test_archives_that_stay_closed_are_named_with_what_to_do(tmp_path, into):
+    inner = zipped(tmp_path / "i.zip", {"ch44.ipynb": ONE}).read_bytes()
+    deeper = zipped(tmp_path / "d.zip", {"inner.zip": inner}).read_bytes()
+    files = {
+        "a_1_5_ch44.ipynb": ONE,
+        "b_2_6_work.zip": deeper,
+        "c_3_7_work.tar.gz": b"",
+        "d_4_8_work.rar": b"",
+        "e_5_9_a.pdf": b"",
+    }
+    done = collect.collect([zipped(tmp_path / "a.zip", files)], into)
+    said = {line.partition("_")[0]: line for line in done.problems}
+    for who, name in (("b", "inner.zip"), ("c", "work.tar.gz"), ("d", "work.rar")):
+        assert f"unpack {name}" in said[who] and "collect again" in said[who]
+    assert "unpack" not in said["e"]
+
+
 @pytest.mark.parametrize(
     "text",
     [
@@ -333,9 +457,32 @@ def test_platforms_own_lists_are_names_too(tmp_path, into, text):
     assert papers(into) == {("jane", "ch44"): ONE} and not done.problems
 
 
+@pytest.mark.parametrize("coding", ["utf-16", "utf-16-le", "utf-16-be", "utf-8", "utf-8-sig"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("first", ["", "sep=;\n", '"sep=;"\n', "SEP=\t\n"])
+def test_names_as_spreadsheets_write_them(tmp_path, into, coding, end, first):
+    between = "\t" if (coding.startswith("utf-16") and not first) or "\t" in first else ";"
+    text = first + between.join(("id", "student")) + "\n" + between.join(("12345", "Zoë, Ågren")) + "\n"
+    mark = "\ufeff" if coding[-3:] in ("-le", "-be") else ""
+    (tmp_path / "names.csv").write_bytes((mark + text.replace("\n", end)).encode(coding))
+    assert roster.load(tmp_path / "names.csv").student(id="12345") == "Zoë, Ågren"
+
+
+@pytest.mark.parametrize(
+    "content", ["id;student\n1;Zoë\n".encode("cp1252"), "id\tstudent\n1\tjo\n".encode("utf-16-le"), b"\xff\xfei"]
+)
+def test_names_in_another_coding_are_refused_with_how_to_save_them(tmp_path, into, content):
+    (tmp_path / "names.csv").write_bytes(content)
+    with pytest.raises(roster.RosterError, match="in Excel, save it as 'CSV UTF-8'"):
+        roster.load(tmp_path / "names.csv")
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
+        ("sep=;\nid;student\n1;jane\n1;li\n", "line 4: the id 1 is li's here and jane's in line 3"),
+        ("sep=,\nid,who\n1,jane\n", "line 2: the columns are id, who"),
+        ("id,student\n1," + "x" * 200_000 + "\n", "is no CSV that can be read (field larger"),
         ("id,student\n1,jane\n2,john\n1,li\n", "line 4: the id 1 is li's here and jane's in line 2; delete one of the two"),
         ("id,student\n1,\n", "line 2: no student in it"),
         ("id,who\n1,jane\n", "line 1: the columns are id, who; wanted are student and one of id, login, email, name"),
@@ -522,6 +669,18 @@ def test_names_that_lead_elsewhere_are_refused(tmp_path, into, name, said):
     done = collect.collect([hostile(tmp_path, name)], into)
     assert papers(into) == {("good", "ch44"): ONE} and len(done.problems) == 1 and said in done.problems[0]
     assert "\x1b" not in done.problems[0] and {path.name for path in tmp_path.iterdir()} == {"a.zip", "submitted"}
+
+
+def test_lines_name_files_as_the_download_does(tmp_path, into):
+    inner = hostile(tmp_path, "../../evil.ipynb").read_bytes()
+    files = {"canvas.zip/doe_7_7016_x.zip": inner, "canvas.zip/roe_8_7017_y.zip": b"PK no zip", "canvas.zip/what.txt": b""}
+    files |= {"moodle/Jo Poe_9_assignsubmission_file_/z.zip": inner, "moodle/Jo Roe_8_assignsubmission_file_z.zip": inner}
+    done = collect.collect([folder(tmp_path / "all", files)], into)
+    said = sorted(line.partition(": ")[0] for line in done.problems if "no notebook" not in line)
+    assert said == [
+        "canvas.zip/doe_7_7016_x.zip", "canvas.zip/roe_8_7017_y.zip", "canvas.zip/what.txt",
+        "moodle/Jo Poe_9_assignsubmission_file_/z.zip", "moodle/Jo Roe_8_assignsubmission_file_z.zip",
+    ]  # fmt: skip
 
 
 def test_links_in_zips_and_folders_are_not_followed(tmp_path, into):

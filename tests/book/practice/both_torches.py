@@ -39,6 +39,8 @@ SAME_TEXT = (
     "a Tensor with", "only one element tensors", "mean(): could not", "std and var only", "argument 'input'", "where expected condition",
 "Index tensor must", "unsupported operand type", "module 'torch'", "'Tensor' object has", "Integers to negative",
 "zero-dimensional tensor", "Index put requires", "max(): Expected", "min(): Expected",
+    "is out of bounds.", "expected target dtype", "Expected input batch_size", "Expected floating point type for target", "multi-target",
+    "Expected target size", "ignore_index is not", "argument 'target'", "argument 'keepdim'", "argument 'largest'",
     "masked_fill", "both arguments to matmul", "expected m1 and m2", "inconsistent tensor size",
 )  # fmt: skip
 """How errors begin, or what is in them, whose whole text is the same."""

@@ -112,6 +112,35 @@ def test_cells_of_all_sorts(told, source, state, message):
             assert shown in result["printed"]
 
 
+@pytest.mark.parametrize(
+    ("imported", "used", "what"),
+    [
+        ("threading", "threading.Thread(target=print).start()", "threading.Thread"),
+        ("threading", "threading.Timer(0, print).start()", "threading.Thread"),
+        ("concurrent.futures", "concurrent.futures.ThreadPoolExecutor().submit(print)", "threading.Thread"),
+        ("_thread", "_thread.start_new_thread(print, ())", "_thread.start_new_thread"),
+        ("builtins", "input('how much? ')", "input"),
+        ("builtins", "breakpoint()", "breakpoint"),
+        ("subprocess", "subprocess.run(['ls'])", "subprocess.Popen"),
+        ("os", "os.system('ls')", "os.system"),
+        ("multiprocessing", "multiprocessing.get_context('fork').Process(target=print).start()", "os.fork"),
+    ],
+)
+def test_what_a_page_cannot_ask_the_system_for_is_in_the_notebook(told, imported, used, what):
+    right = "    return (new_log_probs - old_log_probs).exp()\n"
+    inside, caught, before = (
+        f"import {imported}\n{RATIO}    {used}\n{right}",
+        f"import {imported}\n{RATIO}    try:\n        {used}\n    except Exception:\n        pass\n{right}",
+        f"import {imported}\n{used}\n{RATIO}{right}",
+    )
+    results, _ = told(*(("importance_ratio", source) for source in (inside, caught, before)))
+    assert {(result["state"], result["message"]) for result in results} == {
+        ("error", f"{what} is not in the page; it is in the notebook")
+    }
+    named, _ = told(("importance_ratio", f"import {imported}\n{RATIO}{right}"))
+    assert named[0]["state"] == "correct"
+
+
 def test_an_exercise_may_use_the_readers_own_answer_to_another(told):
     loss = (
         "def clipped_surrogate_loss(new_log_probs, old_log_probs, advantages, clip_range=0.2):\n"

@@ -43,6 +43,42 @@ def test_numbers_laid_on_a_diagonal_lie_where_torch_lays_them(offset, shape):
     assert run([f"r = torch.diag_embed(x, {offset})"], x=(entries, shape, "float64")) == ""
 
 
+@pytest.mark.parametrize(
+    "target",
+    [
+        "T.tensor([0, 1, 4])", "T.tensor([0, -1, 2])", "T.tensor([0, 1, 4]), ignore_index=4", "T.tensor([0., 1, 2])", "T.tensor([0, 1])",
+        "T.tensor([0., 1, 2]).double()", "T.tensor([0, 1, 2]).int()", "T.tensor([True, False, True])", "T.tensor([[0, 1, 2]])",
+        "T.tensor([[0], [1], [2]])", "T.tensor(1)", "[0, 1, 2]", "x.long()", "x.softmax(1)", "x.softmax(1), ignore_index=2",
+        "T.tensor([0, 1, 9]), label_smoothing=0.1", "T.tensor([0, 1, 3]), reduction='none'", "T.tensor([0, 1, 2]), reduction='mean of all'",
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("loss", ["cross_entropy", "nll_loss"])
+def test_classes_that_are_none_are_refused_in_torchs_words(loss, target):
+    x = ([0.1 * number for number in range(12)], (3, 4), "float64")
+    if loss == "nll_loss" and "label" in target:
+        target = target.replace(", label_smoothing=0.1", "")
+    if not (loss == "nll_loss" and "softmax" in target):  # that takes no probabilities, in words about its own kernels
+        assert run([f"r = F.{loss}(x, {target})"], x=x) == ""
+    assert run(["r = F.cross_entropy(x[0], T.tensor(4))"], x=x) == run(["r = F.cross_entropy(x[0], T.tensor(3))"], x=x) == ""
+    assert run(["r = F.cross_entropy(x[None], T.tensor([[0, 1, 2, 3]]))"], x=x) == ""
+    assert run(["r = F.cross_entropy(x[None], T.tensor([0]))"], x=x) == ""
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        *(f"x.{name}(0, {value})" for name in ("sum", "mean", "prod", "amax", "argmin", "logsumexp") for value in (1, 0, None, "x")),
+        *(f"x.{name}({given})" for name in ("std", "var") for given in ("0, 1", "0, True, 1", "0, keepdim=1", "unbiased=0", "0, None")),
+        "x.sum(1, 2)", "T.sum(x, 1, 2)", "x.sum(0, keepdim=1)", "x.max(0, 1)", "x.any(0, 1)", "x.quantile(0.5, 0, 1)", "x.sort(0, 1)[0]",
+        "x.sort(stable=1)[0]", "x.argsort(descending=1)", "x.topk(1, 0, 1)[0]", "T.zeros(2, requires_grad=1)", "T.isclose(x, x, 0, 0, 1)",
+        "x.sum((0, 1), True)", "x.std(0, True, True)", "x.sort(stable=True)[0]", "x.var(0, False)", "x.mean(1, keepdim=False)",
+    ],
+)  # fmt: skip
+def test_a_number_is_no_yes_or_no(call):
+    x = ([0.1 * number for number in range(12)], (3, 4), "float64")
+    assert run([f"r = {call}"], x=x) == ""
+
+
 def run(statements, graph=True, **tensors):
     """How the two torches differ on a program."""
     made = {name: Tensor(tuple(entries), shape, kind) for name, (entries, shape, kind) in tensors.items()}
