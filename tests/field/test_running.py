@@ -19,6 +19,15 @@ from tests.field.warm import Warm
 CASES = {}
 
 
+def place(name):
+    """Which of the perfect notebook's code cells answers an exercise, counted from 1; prose and examples may come and go."""
+    notebook = toolbox.solved()
+    return [one for one in notebook.cells if one.cell_type == "code"].index(toolbox.cell(notebook, name)) + 1
+
+
+SUMS = place("lambda_returns")
+
+
 def case(score=10.0, flags=(), says=None, status="graded"):
     """What must come out: the score, exactly these flags (patterns), exercise → pattern in its message, the status."""
 
@@ -123,8 +132,10 @@ def seaborn_used(nb):
 
 @case(
     7.0,
-    ["cell_1_stopped: line 1, .*einops", "cell_8_stopped: line 1, NameError: name 'Float'"],
-    {"lambda_returns": "; code cell 1 stopped at line 1: .*einops'; code cell 8 stopped at line 1: NameError: name 'Float'"},
+    ["cell_1_stopped: line 1, .*einops", f"cell_{SUMS}_stopped: line 1, NameError: name 'Float'"],
+    {
+        "lambda_returns": f"; code cell 1 stopped at line 1: .*einops'; code cell {SUMS} stopped at line 1: NameError: name 'Float'"
+    },
 )
 def annotated_with_what_is_missing(nb):
     nb.on_top("from einops import rearrange\nfrom jaxtyping import Float\n")
@@ -161,18 +172,18 @@ def colab_guarded(nb):
     nb.on_top("try:\n    from google.colab import drive\nexcept ImportError:\n    drive = None\nfrom tqdm.auto import tqdm\n")
 
 
-@case(flags=["cell_8_stopped: line 3, ZeroDivisionError"])
+@case(flags=[f"cell_{SUMS}_stopped: line 3, ZeroDivisionError"])
 def a_statement_that_fails_runs_no_other_twice(nb):
     nb.before("lambda_returns", "calls = []\ncalls.append(1)\n1 / 0\ncalls.append(2)\n")
     nb.sum_is("(advantages + values + (sum(calls) - 3))")
 
 
-@case(flags=["cell_8_stopped: line [0-9]+, AssertionError"])
+@case(flags=[f"cell_{SUMS}_stopped: line [0-9]+, AssertionError"])
 def a_test_of_ones_own_that_fails(nb):
     nb.find("lambda_returns").source += "\n\nassert False, 'not yet'\n"
 
 
-@case(flags=["cell_8_stopped: line [0-9]+, SystemExit"])
+@case(flags=[f"cell_{SUMS}_stopped: line [0-9]+, SystemExit"])
 def the_end_of_a_cell_by_sys_exit(nb):
     nb.find("lambda_returns").source += "\n\nimport sys\nsys.exit()\nraise KeyError\n"
 
@@ -238,10 +249,13 @@ def newer(version, saved=""):
     if sys.version_info >= tuple(map(int, version.split("."))):
         return {}
     message = (
-        f"code cell 8 is written for Python {version} \\({saved or f'newer than {judge.PYTHON}'}\\), and this is graded with"
+        f"code cell {SUMS} is written for Python {version} \\({saved or f'newer than {judge.PYTHON}'}\\), and this is graded with"
     )
     message += f" Python {judge.PYTHON}: a person will look at it"
-    flags = ["cell_8_stopped: line [0-9]+, SyntaxError", f"newer_python: cell 8 needs {version}, graded with {judge.PYTHON}"]
+    flags = [
+        f"cell_{SUMS}_stopped: line [0-9]+, SyntaxError",
+        f"newer_python: cell {SUMS} needs {version}, graded with {judge.PYTHON}",
+    ]
     return {
         "score": 7.0,
         "flags": flags,
@@ -276,7 +290,7 @@ def exceptions_without_brackets(nb):
     )
 
 
-@case(7.0, ["cell_8_stopped: line [0-9]+, SyntaxError"], {"lambda_returns": "SyntaxError"})
+@case(7.0, [f"cell_{SUMS}_stopped: line [0-9]+, SyntaxError"], {"lambda_returns": "SyntaxError"})
 def wrong_syntax_in_a_notebook_of_312(nb):
     nb.sum_is("(advantages + values")
     nb.node.metadata["language_info"] = {"name": "python", "version": "3.12.7"}
