@@ -186,7 +186,7 @@ def _rollouts(g: SimpleNamespace) -> list[Formula]:
         return g.rewards + g.gamma * following * ~terminated - g.values
 
     dropped = gae(rewards=torch.where(g.truncated, g.values, g.rewards), terminated=ended)  # a step whose residual is 0
-    unlimited, unbroken = gae(truncated=none), gae(next_values=next_cell, terminated=none, truncated=none)
+    unlimited, unbroken = gae(next_values=next_cell, truncated=none), gae(next_values=next_cell, terminated=none, truncated=none)
     first = (0, 5)  # a time limit
     return [
         _formula(
@@ -218,7 +218,7 @@ def _rollouts(g: SimpleNamespace) -> list[Formula]:
             ("one_step_to_lambda_return", "One step ahead to the λ-return: r + γ R(t+1) - V(t).", ahead(g.values + unbroken, none)),
         ),
         _formula(
-            "normalised_rollout", "Advantages of a rollout without time limits, normalised over all of it", 44,
+            "normalised_rollout", "Advantages of a rollout without its time limits, normalised over all of it", 44,
             ch44.normalize_advantages(unlimited),
             ("biased", "The standard deviation is the biased one.", _standard(unlimited, 0)),
             ("deviation_per_environment", "The mean is over everything, the standard deviation (unbiased) each environment's own.",

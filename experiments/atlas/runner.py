@@ -49,7 +49,7 @@ print(json.dumps({"python": platform.python_version(), "installed": dict(sorted(
 """
 SETTINGS = {  # one thread, no accelerator, nothing sent or fetched
     "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": "", "JAX_PLATFORMS": "cpu", "HF_HUB_OFFLINE": "1", "WANDB_MODE": "disabled",
-    "TOKENIZERS_PARALLELISM": "false", "PYTHONWARNINGS": "ignore", "PYTHONHASHSEED": "0", "PYTHONDONTWRITEBYTECODE": "1",
+    "TOKENIZERS_PARALLELISM": "false", "PYTHONWARNINGS": "ignore", "PYTHONHASHSEED": "0",
 }  # fmt: skip
 
 

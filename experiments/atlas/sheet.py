@@ -53,11 +53,11 @@ def statements(path, chosen, names):
       names: what the statements read, and where they leave what they bind.
     """
     text = _text(path)
-    found = []
+    found, lines = [], text.splitlines(keepends=True)
 
     def look(node):
         for child in ast.iter_child_nodes(node):
-            if isinstance(child, ast.stmt) and chosen(ast.get_source_segment(text, child) or ""):
+            if isinstance(child, ast.stmt) and chosen(_source(lines, child)):
                 found.append(child)
             else:
                 look(child)
@@ -78,6 +78,11 @@ def function(path, name, names):
             exec(compile(ast.Module([ast.parse("from __future__ import annotations").body[0], node], []), path, "exec"), names)
             return names[name]
     raise LookupError(f"{path} has no {name}")
+
+
+def _source(lines, node):
+    """As ast.get_source_segment, which would split the file anew each time."""
+    return "".join(lines[node.lineno - 1 : node.end_lineno])[node.col_offset :]
 
 
 def _text(path):

@@ -47,16 +47,24 @@ file = installed("skrl", "agents", "torch", "ppo", "ppo.py")
 
 def update(start, result, **settings):
     """What a statement of PPO.update that begins so binds."""
+    cfg = {"ratio_clip": given.clip_range, "value_clip": 0, "value_loss_scale": 1.0} | settings
     names = {
-        "self": SimpleNamespace(cfg=SimpleNamespace(ratio_clip=given.clip_range, value_clip=0, value_loss_scale=1.0, **settings)),
+        "self": SimpleNamespace(cfg=SimpleNamespace(**cfg)),
         "torch": torch, "F": functional, "next_log_prob": tensor("logp"), "sampled_log_prob": tensor("old_logp"), "kl_divergences": [],
         "sampled_advantages": tensor("adv"), "sampled_returns": tensor("returns"), "sampled_values": tensor("old_values"),
         "predicted_values": tensor("new_values"),
     }  # fmt: skip
-    names["self"].cfg.__dict__.update(settings)
     for part in start:
         statements(file, lambda text, part=part: text.startswith(part), names)
     return names[result]
 
 
 row("approx_kl", update(["with torch.no_grad():\n                        ratio"], "kl_divergence"), "PPO.update", source)
+surrogate = ["ratio = torch.exp(next", "surrogate = ", "surrogate_clipped = ", "policy_loss = -torch.min"]
+row("policy_loss", update(surrogate, "policy_loss"), "PPO.update", source, note="Its advantages are normalised over the rollout beforehand.")
+value_loss = ["if self.cfg.value_clip > 0", "value_loss = self.cfg"]
+row("value_loss", update(value_loss, "value_loss"), "PPO.update", source, "value_clip=0, value_loss_scale=1", "The scale is 2.5 by default.")
+row(
+    "value_loss_clipped", update(value_loss, "value_loss", value_clip=given.clip_range), "PPO.update", source,
+    "value_clip=0.2, the default, value_loss_scale=1", "The scale is 2.5 by default.",
+)  # fmt: skip
