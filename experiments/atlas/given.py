@@ -221,11 +221,29 @@ def _rollouts(g: SimpleNamespace) -> list[Formula]:
             "normalised_rollout", "Advantages of a rollout without its time limits, normalised over all of it", 44,
             ch44.normalize_advantages(unlimited),
             ("biased", "The standard deviation is the biased one.", _standard(unlimited, 0)),
+            ("biased_with_extra_steps",
+             "The standard deviation is the biased one, and steps that are put in behind each episode count, too.",
+             _with_extra_steps(g, unlimited)),
             ("deviation_per_environment", "The mean is over everything, the standard deviation (unbiased) each environment's own.",
              (unlimited - unlimited.mean()) / unlimited.std(1, keepdim=True)),
         ),
         _formula("explained_variance", "Explained variance", 44, ch44.explained_variance(g.new_values, g.returns)),
     ]  # fmt: skip
+
+
+def _with_extra_steps(g, advantages):
+    """Normalised as though a step of reward 0 stood behind each episode, whose advantage runs on into the next one of the row."""
+    extra, after = [], [(value, advantage) for value, advantage in zip(g.values.flatten(), advantages.flatten(), strict=True)]
+    for n, ends in enumerate(g.terminated):
+        for t in range(len(ends)):
+            if not ends[t] and t < len(ends) - 1:
+                continue
+            own = g.final_values[n, t] if ends[t] else g.last_values[n]
+            place = n * len(ends) + t + 1
+            value, advantage = after[place] if place < len(after) else (0.0, 0.0)
+            extra.append(g.gamma * value + g.gamma * g.gae_lambda * advantage - own)
+    every = torch.cat([advantages.flatten(), torch.stack(extra)])
+    return (advantages - every.mean()) / every.std(correction=0)
 
 
 def _standard(x, correction):

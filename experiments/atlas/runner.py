@@ -177,6 +177,27 @@ def run(
         return Outcome(name, None, str(error), (), former)
 
 
+def told(outcome: Outcome) -> list[str]:
+    """An outcome in lines: what went wrong, or how many rows are equal, and what differs from the record that there was."""
+    if outcome.record is None:
+        return [f"{outcome.name}: {outcome.error}"]
+    rows, versions = outcome.record["rows"], _versions(outcome.record)
+    former = _versions(outcome.former) if outcome.former else versions
+    now = versions if versions == former else f"{former} → {versions}"
+    lines = [f"{outcome.name} {now}: {sum(row['equal'] for row in rows)} of {len(rows)} rows equal the course's"]
+    if outcome.former and not outcome.changes:
+        lines[0] += ", as recorded"
+    return [
+        *lines,
+        *(f"  {line}" for line in outcome.changes),
+        *(f"  by no known rule: {line}" for line in outcome.unexplained),
+    ]
+
+
+def _versions(record: Mapping[str, Any]) -> str:
+    return ", ".join(record["versions"].values())
+
+
 def _record(todo: Script, rows: list[dict[str, Any]], found: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "library": todo.name,

@@ -30,7 +30,15 @@ ended = ((steps("terminated") + steps("truncated")) > 0).float()
 buffer = {"rewards": steps("rewards"), "values": steps("values"), "dones": torch.cat([torch.zeros(1, 2), ended[:-1]])}
 buffer |= {name: torch.zeros(8, 2) for name in ("advantages", "returns")}
 self = SimpleNamespace(
-    buffer=buffer, num_envs=2, capacity=8, full=True, pos=8, use_gae=True, gamma=given.gamma, gae_lambda=given.gae_lambda, device="cpu"
+    buffer=buffer,
+    num_envs=2,
+    capacity=8,
+    full=True,
+    pos=8,
+    use_gae=True,
+    gamma=given.gamma,
+    gae_lambda=given.gae_lambda,
+    device="cpu",
 )
 compute(self, tensor("last_values"), ended[-1])
 row(

@@ -5,7 +5,7 @@
 # [tool.atlas]
 # libraries = ["cleanrl"]
 # bare = ["cleanrl==1.2.0"]
-# why = "Each algorithm is one script without functions; the statements of its training loop are run as they stand in the installed file. The last release is of 2023."
+# why = "Each algorithm is one script; statements of its loop are run as they stand there. The last release is of 2023."
 # ///
 """The statements of `ppo_continuous_action.py` and `sac_continuous_action.py` that make advantages, losses and targets."""
 
@@ -50,8 +50,20 @@ row("gae", names["advantages"].T, "the loop that bootstraps", f"cleanrl/{PPO}", 
 
 def update(**settings):
     args = SimpleNamespace(clip_coef=given.clip_range, **settings)
-    beginnings = ["logratio = ", "ratio = ", "with torch.no_grad():\n                    # calculate approx_kl", "mb_advantages = b_adv"]
-    beginnings += ["if args.norm_adv", "pg_loss1 = ", "pg_loss2 = ", "pg_loss = ", "newvalue = newvalue.view", "if args.clip_vloss"]
+    beginnings = [
+        "logratio = ",
+        "ratio = ",
+        "with torch.no_grad():\n                    # calculate approx_kl",
+        "mb_advantages = b_adv",
+    ]
+    beginnings += [
+        "if args.norm_adv",
+        "pg_loss1 = ",
+        "pg_loss2 = ",
+        "pg_loss = ",
+        "newvalue = newvalue.view",
+        "if args.clip_vloss",
+    ]
     return run(
         PPO, beginnings, args=args, newlogprob=tensor("logp"), b_logprobs=tensor("old_logp"), mb_inds=np.arange(6), clipfracs=[],
         b_advantages=tensor("adv"), newvalue=tensor("new_values"), b_values=tensor("old_values"), b_returns=tensor("returns"),
@@ -69,14 +81,25 @@ row("value_loss_clipped", default["v_loss"], call, source, "clip_vloss=True, the
 
 column = {name: tensor(name)[:, None] for name in ("q1", "q2", "next_logp", "sac_rewards")}
 data = SimpleNamespace(
-    observations=None, actions=None, next_observations=None, rewards=column["sac_rewards"], dones=tensor("sac_terminated")[:, None]
+    observations=None,
+    actions=None,
+    next_observations=None,
+    rewards=column["sac_rewards"],
+    dones=tensor("sac_terminated")[:, None],
 )
 networks = {
     "actor": SimpleNamespace(get_action=lambda obs: (None, column["next_logp"], None)), "alpha": given.alpha,
     "log_alpha": torch.tensor([math.log(given.alpha)]), "target_entropy": given.target_entropy,
     "args": SimpleNamespace(gamma=given.gamma, batch_size=4), "data": data,
 } | {name: lambda *seen, q=name[2]: column[f"q{q}"] for name in ("qf1", "qf2", "qf1_target", "qf2_target")}  # fmt: skip
-critics = ["with torch.no_grad():\n                next_state_actions", "qf1_a_values", "qf2_a_values", "qf1_loss", "qf2_loss", "qf_loss"]
+critics = [
+    "with torch.no_grad():\n                next_state_actions",
+    "qf1_a_values",
+    "qf2_a_values",
+    "qf1_loss",
+    "qf2_loss",
+    "qf_loss",
+]
 source, call = f"cleanrl/{SAC}", "the training loop"
 names = run(SAC, critics, **networks)
 row("soft_q_target", names["next_q_value"], call, source)

@@ -5,18 +5,18 @@
 # [tool.atlas]
 # libraries = ["di-engine"]
 # bare = ["di-engine==0.5.3"]
-# why = "The package asks for old versions of much that is not needed here; its functions are built from their installed files, without the wrapper that looks for a compiled variant."
+# why = "The package asks for much that is not needed here; its functions are built from their installed files."
 # ///
 """`gae`, with one flag and with two, and `ppo_error` on two actions, of which the one that was taken has the log-probability of the
 input."""
 
 from collections import namedtuple
-from typing import Optional, Tuple
+from typing import Optional
 
 import torch
 from sheet import function, given, installed, row, statements
 
-names = {"torch": torch, "namedtuple": namedtuple, "Optional": Optional, "Tuple": Tuple}
+names = {"torch": torch, "namedtuple": namedtuple, "Optional": Optional, "Tuple": tuple}
 gae = function(installed("ding", "rl_utils", "gae.py"), "gae", names)
 losses = installed("ding", "rl_utils", "ppo.py")
 statements(losses, lambda text: "= namedtuple(" in text.partition("\n")[0], names)

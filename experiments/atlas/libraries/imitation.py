@@ -12,10 +12,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from imitation.algorithms.bc import BehaviorCloningLossCalculator
 from imitation.algorithms.preference_comparisons import CrossEntropyRewardLoss, PreferenceModel
 from imitation.rewards.reward_nets import BasicRewardNet
-from gymnasium import spaces
 from sheet import given, row
 
 box = spaces.Box(-1, 1, (1,), np.float32)
@@ -40,7 +40,8 @@ for gap in given.far_gaps:
 logits, actions = torch.tensor(given.bc_logits), torch.tensor(given.bc_actions)
 distribution = torch.distributions.Categorical(logits=logits)
 policy = SimpleNamespace(
-    evaluate_actions=lambda obs, acts: (None, distribution.log_prob(acts), distribution.entropy()), parameters=lambda: [torch.zeros(1)]
+    evaluate_actions=lambda obs, acts: (None, distribution.log_prob(acts), distribution.entropy()),
+    parameters=lambda: [torch.zeros(1)],
 )
 metrics = BehaviorCloningLossCalculator(ent_weight=1e-3, l2_weight=0.0)(policy, torch.zeros(4, 1), actions)
 source, call = "imitation/algorithms/bc.py", "BehaviorCloningLossCalculator"

@@ -11,7 +11,7 @@
 
 import itertools
 from types import SimpleNamespace
-from typing import Any, List, Optional, Tuple, Union
+from typing import Any, Optional, Union
 
 import torch
 from sheet import function, given, installed, row
@@ -19,7 +19,16 @@ from torch import nn
 
 losses, utils = installed("openrlhf", "models", "loss.py"), installed("openrlhf", "models", "utils.py")
 maker = installed("openrlhf", "trainer", "ppo_utils", "experience_maker.py")
-names = {"torch": torch, "nn": nn, "F": nn.functional, "Optional": Optional, "Tuple": Tuple, "Union": Union, "List": List, "Any": Any}
+names = {
+    "torch": torch,
+    "nn": nn,
+    "F": nn.functional,
+    "Optional": Optional,
+    "Tuple": tuple,
+    "Union": Union,
+    "List": list,
+    "Any": Any,
+}
 for name in ("masked_mean", "compute_approx_kl", "compute_reward", "masked_normalize"):
     function(utils, name, names)
 for name in ("aggregate_loss", "PolicyLoss", "ValueLoss", "DPOLoss", "PairWiseLoss"):
@@ -44,11 +53,20 @@ row("token_approx_kl", kl, "PolicyLoss, third result", source)
 by_row = names["PolicyLoss"](given.clip_range, given.clip_range, token_level_loss=False)(*tokens, action_mask=mask)[0]
 row("token_policy_loss", by_row, "PolicyLoss", source, "token_level_loss=False")
 far = [torch.tensor([[getattr(given, name)]]) for name in ("far_logp", "far_old", "far_adv")]
-row("token_policy_loss_far", names["PolicyLoss"](given.clip_range, given.clip_range)(*far, torch.ones(1, 1))[0], "PolicyLoss", source)
+row(
+    "token_policy_loss_far",
+    names["PolicyLoss"](given.clip_range, given.clip_range)(*far, torch.ones(1, 1))[0],
+    "PolicyLoss",
+    source,
+)
 critic = [tensor(name) for name in ("tok_new_values", "tok_values", "tok_returns")]
 row("token_value_loss", names["ValueLoss"]()(*critic, action_mask=mask), "ValueLoss", source, "clip_eps=None, the default")
 row(
-    "token_value_loss_clipped", names["ValueLoss"](given.tok_clip_range_vf)(*critic, action_mask=mask), "ValueLoss", source, "clip_eps=0.2"
+    "token_value_loss_clipped",
+    names["ValueLoss"](given.tok_clip_range_vf)(*critic, action_mask=mask),
+    "ValueLoss",
+    source,
+    "clip_eps=0.2",
 )
 pairs = [tensor(name) for name in ("chosen", "rejected", "ref_chosen", "ref_rejected")]
 row("dpo_loss_mean", names["DPOLoss"](given.beta)(*pairs)[0], "DPOLoss", source)
@@ -63,7 +81,13 @@ source = "openrlhf/models/utils.py"
 kl = names["compute_approx_kl"](tensor("tok_old"), tensor("tok_ref"), kl_estimator="k1")
 rewards = names["compute_reward"](tensor("score"), given.kl_coef, kl, action_mask=mask)
 row("kl_penalised_rewards", kept(rewards), "compute_approx_kl, compute_reward", source)
-row("token_k3", names["compute_approx_kl"](tensor("tok_old"), tensor("tok_ref"), kl_estimator="k3")[mask], "compute_approx_kl", source, "k3")
+row(
+    "token_k3",
+    names["compute_approx_kl"](tensor("tok_old"), tensor("tok_ref"), kl_estimator="k3")[mask],
+    "compute_approx_kl",
+    source,
+    "k3",
+)
 k3_far = names["compute_approx_kl"](torch.tensor([given.k3_logp]), torch.tensor([given.k3_ref]), kl_estimator="k3")
 row("token_k3_far", k3_far.mean(), "compute_approx_kl", source, "k3")
 row("whitened", kept(names["masked_normalize"](tensor("tok_adv"), mask)), "masked_normalize", source, "dim=1, the default")
@@ -84,9 +108,13 @@ def experiences(estimator, samples, rewards, kl_coef, **columns):
         rollout=SimpleNamespace(n_samples_per_prompt=samples), algo=SimpleNamespace(advantage=advantage),
         reward=SimpleNamespace(clip_range=None),
     )  # fmt: skip
-    self = SimpleNamespace(strategy=SimpleNamespace(args=args), kl_ctl=SimpleNamespace(value=kl_coef), advantage_estimator=estimator)
+    self = SimpleNamespace(
+        strategy=SimpleNamespace(args=args), kl_ctl=SimpleNamespace(value=kl_coef), advantage_estimator=estimator
+    )
     self.get_advantages_and_returns = lambda *arguments: advantages_of(self, *arguments)
-    self.get_cumulative_returns = lambda rewards, mask, gamma: function(maker, "get_cumulative_returns", names)(self, rewards, mask, gamma)
+    self.get_cumulative_returns = lambda rewards, mask, gamma: function(maker, "get_cumulative_returns", names)(
+        self, rewards, mask, gamma
+    )
     batch = SimpleNamespace(index=list(range(len(rewards))), rewards=rewards, info={}, **columns)
     return compute(self, [batch])[0].advantages
 

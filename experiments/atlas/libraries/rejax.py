@@ -37,4 +37,10 @@ def advantages(n):
     return calculate_gae(self, steps, jnp.array(array("last_values")[n]))[0]
 
 
-row("gae", np.array([advantages(n) for n in range(2)]), "PPO.calculate_gae", "rejax/algos/ppo.py", "one flag for both kinds of end")
+row(
+    "gae",
+    np.array([advantages(n) for n in range(2)]),
+    "PPO.calculate_gae",
+    "rejax/algos/ppo.py",
+    "one flag for both kinds of end",
+)

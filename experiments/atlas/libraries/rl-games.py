@@ -23,7 +23,9 @@ def tensor(name):
 
 def advantages(infos):
     rewards = []
-    self = SimpleNamespace(gamma=given.gamma, tau=given.gae_lambda, horizon_length=8, value_bootstrap=True, cast_obs=lambda obs: obs)
+    self = SimpleNamespace(
+        gamma=given.gamma, tau=given.gae_lambda, horizon_length=8, value_bootstrap=True, cast_obs=lambda obs: obs
+    )
     for t in range(8):
         names = {"self": self, "shaped_rewards": tensor("rewards")[:, t, None].clone(), "infos": infos(t)}
         names["res_dict"] = {"values": tensor("values")[:, t, None]}
@@ -55,6 +57,18 @@ source = "rl_games/common/common_losses.py"
 losses = common_losses.actor_loss(-tensor("old_logp"), -tensor("logp"), tensor("adv"), True, given.clip_range)
 row("policy_loss", losses.mean(), "common_losses.actor_loss", source, note="It takes negative log-probabilities.")
 critic = tensor("old_values"), tensor("new_values"), given.clip_range, tensor("returns")
-row("value_loss", common_losses.default_critic_loss(*critic, False).mean(), "common_losses.default_critic_loss", source, "clip_value=False")
-row("value_loss_clipped", common_losses.default_critic_loss(*critic, True).mean(), "common_losses.default_critic_loss", source, "clip_value=True")
+row(
+    "value_loss",
+    common_losses.default_critic_loss(*critic, False).mean(),
+    "common_losses.default_critic_loss",
+    source,
+    "clip_value=False",
+)
+row(
+    "value_loss_clipped",
+    common_losses.default_critic_loss(*critic, True).mean(),
+    "common_losses.default_critic_loss",
+    source,
+    "clip_value=True",
+)
 row("normalised", common_losses.normalize_advantage(tensor("adv")), "common_losses.normalize_advantage", source)

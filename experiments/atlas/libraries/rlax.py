@@ -31,7 +31,13 @@ row(
     "One array of values has no place for that of a last observation.",
 )  # fmt: skip
 bootstrap = given.gamma * array("final_values") * array("truncated") * (1 - array("terminated"))
-row("gae", advantages(array("rewards") + bootstrap, given.gamma * ~ended), call, source, "γ V added to rewards, discount 0 at every end")
+row(
+    "gae",
+    advantages(array("rewards") + bootstrap, given.gamma * ~ended),
+    call,
+    source,
+    "γ V added to rewards, discount 0 at every end",
+)
 
 source = "rlax/_src/policy_gradients.py"
 ratios = np.exp(array("logp") - array("old_logp"))

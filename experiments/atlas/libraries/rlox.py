@@ -40,7 +40,9 @@ def tensor(name):
 
 def loss(**settings):
     old = tensor("old_logp"), tensor("adv"), tensor("returns"), tensor("old_values")
-    return PPOLoss(clip_eps=given.clip_range, vf_coef=given.vf_coef, ent_coef=given.ent_coef, **settings)(Policy(), None, None, *old)[1]
+    return PPOLoss(clip_eps=given.clip_range, vf_coef=given.vf_coef, ent_coef=given.ent_coef, **settings)(
+        Policy(), None, None, *old
+    )[1]
 
 
 source = "rlox/losses.py"

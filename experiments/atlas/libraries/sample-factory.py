@@ -9,7 +9,8 @@
 # ///
 """`gae_advantages`, with the flag that `make_dones` makes of both."""
 
-from typing import Sequence, Union
+from collections.abc import Sequence
+from typing import Union
 
 import numpy as np
 import torch

@@ -57,7 +57,9 @@ class Batch:
 
 
 def train(**settings):
-    model = MaskablePPO("MlpPolicy", Nothing(), n_steps=8, batch_size=8, n_epochs=1, clip_range=given.clip_range, device="cpu", **settings)
+    model = MaskablePPO(
+        "MlpPolicy", Nothing(), n_steps=8, batch_size=8, n_epochs=1, clip_range=given.clip_range, device="cpu", **settings
+    )
     model.set_logger(Logger(None, []))
     model.rollout_buffer = Batch()
     moved = next(model.policy.parameters())

@@ -61,9 +61,22 @@ def update(start, result, **settings):
 
 row("approx_kl", update(["with torch.no_grad():\n                        ratio"], "kl_divergence"), "PPO.update", source)
 surrogate = ["ratio = torch.exp(next", "surrogate = ", "surrogate_clipped = ", "policy_loss = -torch.min"]
-row("policy_loss", update(surrogate, "policy_loss"), "PPO.update", source, note="Its advantages are normalised over the rollout beforehand.")
+row(
+    "policy_loss",
+    update(surrogate, "policy_loss"),
+    "PPO.update",
+    source,
+    note="Its advantages are normalised over the rollout beforehand.",
+)
 value_loss = ["if self.cfg.value_clip > 0", "value_loss = self.cfg"]
-row("value_loss", update(value_loss, "value_loss"), "PPO.update", source, "value_clip=0, value_loss_scale=1", "The scale is 2.5 by default.")
+row(
+    "value_loss",
+    update(value_loss, "value_loss"),
+    "PPO.update",
+    source,
+    "value_clip=0, value_loss_scale=1",
+    "The scale is 2.5 by default.",
+)
 row(
     "value_loss_clipped", update(value_loss, "value_loss", value_clip=given.clip_range), "PPO.update", source,
     "value_clip=0.2, the default, value_loss_scale=1", "The scale is 2.5 by default.",

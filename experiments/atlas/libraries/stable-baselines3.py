@@ -105,7 +105,9 @@ class Batch:
 
 def ppo(**settings):
     """What PPO.train logs."""
-    model = PPO("MlpPolicy", Played(), n_steps=STEPS, batch_size=STEPS, n_epochs=1, clip_range=given.clip_range, device="cpu", **settings)
+    model = PPO(
+        "MlpPolicy", Played(), n_steps=STEPS, batch_size=STEPS, n_epochs=1, clip_range=given.clip_range, device="cpu", **settings
+    )
     model.set_logger(Logger(None, []))
     model.rollout_buffer = Batch()
     moved = next(model.policy.parameters())
@@ -118,7 +120,9 @@ def ppo(**settings):
 
 def soft_actor_critic(**settings):
     """What SAC.train logs, and the targets it fits its critics to."""
-    model = SAC("MlpPolicy", Played(), gamma=given.gamma, target_entropy=given.target_entropy, buffer_size=8, device="cpu", **settings)
+    model = SAC(
+        "MlpPolicy", Played(), gamma=given.gamma, target_entropy=given.target_entropy, buffer_size=8, device="cpu", **settings
+    )
     model.set_logger(Logger(None, []))
     column = {name: tensor(name)[:, None] for name in ("q1", "q2", "sac_rewards", "sac_terminated", "next_logp")}
     states = torch.zeros(4, 1)

@@ -67,5 +67,11 @@ plain = update()
 row("policy_loss", plain.actor_loss.mean, call, source, "advantage_normalization=False")
 row("value_loss", plain.vf_loss.mean, call, source)
 row("total_loss", plain.loss.mean, call, source, "advantage_normalization=False, ent_coef=0.01, the default")
-row("policy_loss_normalised", update(advantage_normalization=True).actor_loss.mean, call, source, "advantage_normalization=True, the default")
+row(
+    "policy_loss_normalised",
+    update(advantage_normalization=True).actor_loss.mean,
+    call,
+    source,
+    "advantage_normalization=True, the default",
+)
 row("value_loss_clipped", update(value_clip=True).vf_loss.mean, call, source, "value_clip=True")

@@ -61,7 +61,9 @@ class Critic(torch.nn.Module):
 def loss(**settings):
     actor = ProbabilisticTensorDictSequential(
         TensorDictModule(Logits(), ["observation"], ["logits"]),
-        ProbabilisticTensorDictModule(["logits"], ["action"], distribution_class=torch.distributions.Categorical, return_log_prob=True),
+        ProbabilisticTensorDictModule(
+            ["logits"], ["action"], distribution_class=torch.distributions.Categorical, return_log_prob=True
+        ),
     )
     critic = TensorDictModule(Critic(), ["observation"], ["state_value"])
     batch = TensorDict(
@@ -91,4 +93,10 @@ row(
 )  # fmt: skip
 row("policy_loss_normalised", loss(normalize_advantage=True)["loss_objective"], call, source, "normalize_advantage=True")
 row("value_loss", loss(loss_critic_type="l2")["loss_critic"], call, source, "loss_critic_type='l2'")
-row("value_loss_clipped", loss(loss_critic_type="l2", clip_value=given.clip_range)["loss_critic"], call, source, "l2, clip_value=0.2")
+row(
+    "value_loss_clipped",
+    loss(loss_critic_type="l2", clip_value=given.clip_range)["loss_critic"],
+    call,
+    source,
+    "l2, clip_value=0.2",
+)

@@ -29,7 +29,10 @@ row("kl_penalised_rewards", kept(rewards), "rlhf.get_rewards_ppo", source)
 rewards, values = kept(rewards), tensor("tok_values")
 arguments = given.tok_gamma, given.gae_lambda
 note = "Its second result less the values, as the first is whitened."
-for before, setting in ((kept(values), "values at the padding set to 0 by the caller"), (values, "values at the padding as they are")):
+for before, setting in (
+    (kept(values), "values at the padding set to 0 by the caller"),
+    (values, "values at the padding as they are"),
+):
     _, returns = rlhf.estimate_advantages(before, rewards, *arguments, masks=mask)
     row("token_gae", kept(returns - before), "rlhf.estimate_advantages", source, setting, note)
 advantages, _ = rlhf.estimate_advantages(kept(values), rewards, *arguments, masks=mask)

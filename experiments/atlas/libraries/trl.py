@@ -37,7 +37,9 @@ def model(prefix):
     sums = torch.cat([tensor(f"{prefix}chosen"), tensor(f"{prefix}rejected")])
     logps = sums[:, None] / torch.tensor(lengths)[:, None] * mask[:, 1:]
     nothing = torch.zeros_like(logps)
-    outputs = SimpleNamespace(log_probs=logps, entropy=nothing, mean_logits=nothing, is_top1=nothing.bool(), log_sum_sq_probs=nothing)
+    outputs = SimpleNamespace(
+        log_probs=logps, entropy=nothing, mean_logits=nothing, is_top1=nothing.bool(), log_sum_sq_probs=nothing
+    )
     return lambda **inputs: outputs
 
 

@@ -2,7 +2,7 @@
 # requires-python = ">=3.11"
 # dependencies = [
 #   "numpy==2.4.6", "torch==2.13.0", "ray==2.60.0", "tensordict==0.15.3", "omegaconf==2.3.1", "codetiming==1.4.0", "hydra-core==1.3.8",
-#   "transformers==5.24.0", "pandas==3.1.1", "datasets==5.2.0", "packaging==26.4",
+#   "transformers==5.24.0", "pandas==3.1.1", "datasets==5.2.0", "packaging==26.4", "orjson==3.13.0",
 # ]
 #
 # [tool.atlas]
@@ -35,11 +35,19 @@ at_the_end = torch.zeros(3, 5)
 at_the_end[torch.arange(3), mask.sum(1) - 1] = tensor("score")
 rewards = kept(core_algos.compute_rewards(at_the_end, tensor("tok_old"), tensor("tok_ref"), given.kl_coef))
 row("kl_penalised_rewards", rewards, "compute_rewards", source)
-advantages, returns = core_algos.compute_gae_advantage_return(rewards, tensor("tok_values"), mask, given.tok_gamma, given.gae_lambda)
+advantages, returns = core_algos.compute_gae_advantage_return(
+    rewards, tensor("tok_values"), mask, given.tok_gamma, given.gae_lambda
+)
 call = "compute_gae_advantage_return"
-row("token_gae", kept(returns - tensor("tok_values")), call, source, note="Its second result less the values, as the first is whitened.")
+row(
+    "token_gae",
+    kept(returns - tensor("tok_values")),
+    call,
+    source,
+    note="Its second result less the values, as the first is whitened.",
+)
 row("whitened_token_gae", kept(advantages), call, source)
-whitened = torch_functional.masked_whiten(tensor("tok_adv"), mask)
+whitened = torch_functional.masked_whiten(tensor("tok_adv"), mask.float())
 row("whitened", kept(whitened), "torch_functional.masked_whiten", "verl/utils/torch_functional.py")
 
 config = ActorConfig(
@@ -74,7 +82,12 @@ call = "compute_grpo_outcome_advantage"
 groups = tensor("group_rewards").flatten()[:, None]
 advantages, _ = core_algos.compute_grpo_outcome_advantage(groups, torch.ones(12, 1), np.repeat(np.arange(3), 4))
 row(
-    "group_advantages", advantages.reshape(3, 4), call, source, note="It adds 1e-6 to the deviation, hence the tolerance.", tolerance=1e-5
+    "group_advantages",
+    advantages.reshape(3, 4),
+    call,
+    source,
+    note="It adds 1e-6 to the deviation, hence the tolerance.",
+    tolerance=1e-5,
 )
 lone = torch.tensor([[given.lone_reward]])
 advantages, _ = core_algos.compute_grpo_outcome_advantage(lone, torch.ones(1, 1), np.zeros(1, int))
