@@ -36,7 +36,7 @@ at_the_end[torch.arange(3), mask.sum(1) - 1] = tensor("score")
 rewards = kept(core_algos.compute_rewards(at_the_end, tensor("tok_old"), tensor("tok_ref"), given.kl_coef))
 row("kl_penalised_rewards", rewards, "compute_rewards", source)
 advantages, returns = core_algos.compute_gae_advantage_return(
-    rewards, tensor("tok_values"), mask, given.tok_gamma, given.gae_lambda
+    rewards, tensor("tok_values"), mask.float(), given.tok_gamma, given.gae_lambda
 )
 call = "compute_gae_advantage_return"
 row(
