@@ -52,6 +52,7 @@ if TYPE_CHECKING:
 
 BOOK = ROOT / "book"
 STAGE = BOOK / "_stage"
+ATLAS = ROOT / "experiments" / "atlas"
 PUBLISHED = ("*.html", "searchindex.js", "_static/*", "_images/*", "_downloads/*")
 JUPYTER_BOOK = """
 import json, sys
@@ -116,6 +117,7 @@ def staged_files(chapters: list[Chapter], with_solutions: bool) -> dict[str, byt
         files |= _kept(name, keys[chapter.assignment], functools.partial(_staged, chapter, with_solutions))
     files |= _kept("staged-kill-matrix", keys["kill-matrix"], functools.partial(_staged_kill_matrix, chapters))
     files |= _kept("staged-practice", keys["practice"], functools.partial(_staged_practice, chapters))
+    files |= _kept("staged-atlas", keys["atlas"], _staged_atlas)
     return files | assets() | practice_files(chapters, files, with_solutions, keys)
 
 
@@ -142,6 +144,13 @@ def _staged_practice(chapters: list[Chapter]) -> tuple[dict[str, bytes], bool]:
     judged = {f"{chapter.number}. {chapter.title}": practice_rows(chapter, keys) for chapter in chapters}
     proved = not any("unproved" in row for rows in judged.values() for row in rows)
     return {"practice.md": practice_page(judged).encode()}, proved
+
+
+def _staged_atlas() -> tuple[dict[str, bytes], bool]:
+    """What other libraries compute, from the records of experiments/atlas."""
+    from autograder.publishing import atlas_page  # loads torch, for the book's own numbers
+
+    return atlas_page.staged(), True
 
 
 def _kept(name: str, key: str, make: Callable[[], tuple[dict[str, bytes], bool]]) -> dict[str, bytes]:
@@ -174,6 +183,7 @@ def _stage_keys(chapters: list[Chapter], with_solutions: bool) -> dict[str, str]
     return keys | {
         "kill-matrix": content_hash([common, *titles], records),
         "practice": content_hash([judging, *titles], [BOOK / "practice.md"]),
+        "atlas": content_hash([common], [BOOK / "atlas.md", *atlas_records()]),
         "handed": content_hash([judging, str(with_solutions)], []),
     }
 
@@ -232,7 +242,7 @@ def docname(chapter: Chapter) -> str:
 def table_of_contents(chapters: list[Chapter]) -> dict:
     """sphinx-external-toc's table, from the chapters' front matter."""
     entries = [{"file": docname(chapter), "title": f"{chapter.number}. {chapter.title}"} for chapter in chapters]
-    appendices = [{"file": "notation"}, {"file": "kill-matrix"}, {"file": "practice"}, {"file": "format"}]
+    appendices = [{"file": "notation"}, {"file": "kill-matrix"}, {"file": "practice"}, {"file": "atlas"}, {"file": "format"}]
     how_to = {"caption": "How to use this book", "chapters": [{"file": page} for page in HOW_TO]}
     parts = [how_to, {"caption": "Chapters", "chapters": entries}, {"caption": "Appendices", "chapters": appendices}]
     return {"format": "jb-book", "root": "index", "parts": parts}
@@ -441,7 +451,8 @@ def _build_key(chapters: list[Chapter], with_solutions: bool) -> str:
     more of the code than their outputs rest on, and rendering them again is quick."""
     own = [path for path in BOOK.rglob("*") if path.is_file() and not path.relative_to(BOOK).parts[0].startswith("_")]
     code = [path for folder in ("autograder", "course_lib", "solutions") for path in (ROOT / folder).rglob("*.py")]
-    kept = [*kept_records(), ROOT / "requirements.txt", ROOT / "constraints.txt"]
+    code += ATLAS.glob("*.py")
+    kept = [*kept_records(), *atlas_records(), ROOT / "requirements.txt", ROOT / "constraints.txt"]
     chapters_own = [chapter.path for chapter in chapters]
     outputs = [execution_key(chapter) for chapter in chapters]
     return content_hash(
@@ -452,6 +463,11 @@ def _build_key(chapters: list[Chapter], with_solutions: bool) -> str:
 def kept_records() -> list[Path]:
     """The files of autograder.proving.kept and .practice, which this module does not import, as they load torch."""
     return sorted((ROOT / "autograder" / "proving" / "records").rglob("*.json"))
+
+
+def atlas_records() -> list[Path]:
+    """What `course atlas` has written, and the list of what it cannot run."""
+    return [*sorted((ATLAS / "records").glob("*.json")), ATLAS / "not_run.yml"]
 
 
 def _is_current(out: Path, key: str) -> bool:

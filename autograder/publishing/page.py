@@ -44,7 +44,7 @@ def staged_files(own: Chapter, with_solutions: bool) -> dict[str, bytes]:
     """What Sphinx reads, by path relative to the staging folder: the page, and stubs in the places of all others."""
     chapters = chapter.all_chapters()
     files = {"index.md": b"# Policy Optimisation\n\nOne page of the book: {doc}`" + book.docname(own).encode() + b"`.\n"}
-    files |= {f"{name}.md": _stub(name.rpartition("/")[2]) for name in (*book.HOW_TO, "notation", "practice", "format")}
+    files |= {f"{name}.md": _stub(name.rpartition("/")[2]) for name in (*book.HOW_TO, "notation", "practice", "atlas", "format")}
     for other in chapters:
         if other.number != own.number:
             text = f"# {other.number}. {other.title}\n\nThis chapter is not built here."

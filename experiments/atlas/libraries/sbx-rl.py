@@ -43,5 +43,5 @@ source, call = "sbx/ppo/ppo.py", "PPO._one_update"
 _, policy_loss, entropy_loss, value_loss, ratio = update(normalize_advantage=False)
 row("policy_loss", policy_loss, call, source, "normalize_advantage=False")
 row("entropy_loss", entropy_loss, call, source, note="Minus the mean entropy is logged.")
-row("value_loss", value_loss, call, source, note="The coefficient, 0.5, is already inside what is logged.")
+row("value_loss", value_loss, call, source, "as logged, times vf_coef=0.5")
 row("policy_loss_normalised", update()[1], call, source, "normalize_advantage=True, the default")

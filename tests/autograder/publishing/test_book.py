@@ -254,7 +254,7 @@ def test_table_of_contents_comes_from_the_front_matter(tiny):
     assert sorted(f"{entry['file']}.md" for entry in how_to["chapters"]) == [f"how-to/{path.name}" for path in HOW_TO_PAGES]
     assert [entry["file"] for entry in chapters["chapters"]] == ["chapters/ch98_before", "chapters/ch99_tiny"]
     assert chapters["chapters"][1]["title"] == f"99. {tiny.chapter.title}"
-    assert [entry["file"] for entry in appendices["chapters"]] == ["notation", "kill-matrix", "practice", "format"]
+    assert [entry["file"] for entry in appendices["chapters"]] == ["notation", "kill-matrix", "practice", "atlas", "format"]
 
 
 def test_notation_page_has_every_name_and_keeps_bars_inside_their_cells():
@@ -390,7 +390,7 @@ def bare(tiny, tmp_path_factory):
         patch.setattr(
             book,
             "_stage_keys",
-            lambda chapters, with_solutions: dict.fromkeys(("ch98", "ch99", "kill-matrix", "practice", "handed"), "tiny"),
+            lambda chapters, with_solutions: dict.fromkeys(("ch98", "ch99", "kill-matrix", "practice", "atlas", "handed"), "tiny"),
         )
         patch.setattr(book, "cache_folder", lambda: folder)
         patch.setattr(book, "STAGE", folder / "stage")
@@ -422,6 +422,7 @@ def test_only_pages_and_what_they_show_is_published(bare):
         "notation.html",
         "kill-matrix.html",
         "practice.html",
+        "atlas.html",
         "format.html",
         "search.html",
         "searchindex.js",
