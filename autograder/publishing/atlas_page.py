@@ -109,13 +109,18 @@ def _section(records: Records, formula: Formula) -> str:
         "| Library | Computes | By the rule | Called |",
         "|---|---|---|---|",
     ]
-    return "\n".join([*lines, *(_line(record, row) for record, row in _rows(records, formula.name)), "", ":::"])
+    return "\n".join([*lines, *(_line(record, row, formula) for record, row in _rows(records, formula.name)), "", ":::"])
 
 
-def _line(record: Mapping[str, Any], row: Mapping[str, Any]) -> str:
+def _sentences(formula: Formula) -> dict[str, str]:
+    """What each rule of a formula says, by its name."""
+    return {"": "By no known rule."} | {rule.name: rule.sentence for rule in formula.rules}
+
+
+def _line(record: Mapping[str, Any], row: Mapping[str, Any], formula: Formula) -> str:
     library = f"{' '.join(record['versions'])} {' '.join(record['versions'].values())}"
     near = "" if row["tolerance"] == TOLERANCE else f" to {row['tolerance']:g}"
-    rule = f"equal{near}" if row["equal"] else row["sentence"] or "no known rule"
+    rule = f"equal{near}" if row["equal"] else _sentences(formula)[row["rule"]]
     rule += f". {row['note']}" if row["equal"] and row["note"] else f" {row['note']}"
     cells = [f"{library}{_in_brackets(row['setting'])}", _difference(row["numbers"], row["ours"]), _plain(rule)]
     return f"| {' | '.join(cells)} | `{row['call']}` in `{row['source']}`, {record['date'].replace('-', NO_BREAK)} |"
@@ -178,9 +183,8 @@ def table(records: Records, described: Mapping[str, Formula]) -> str:
 def _entries(records: Records, described: Mapping[str, Formula]) -> Iterator[dict[str, Any]]:
     for formula in described.values():
         for record, row in _rows(records, formula.name):
-            entry = {
-                name: row[name] for name in ("formula", "setting", "tolerance", "rule", "sentence", "call", "source", "note")
-            }
+            entry = {name: row[name] for name in ("formula", "setting", "tolerance", "rule", "call", "source", "note")}
+            entry["sentence"] = "" if row["equal"] else _sentences(formula)[row["rule"]]
             entry |= {"title": formula.title, "chapter": formula.chapter or "", "equal": "yes" if row["equal"] else "no"}
             entry |= {
                 "library": " ".join(record["versions"]),

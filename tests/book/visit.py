@@ -16,7 +16,16 @@ LOOKS = {  # colour scheme, width in CSS pixels
     "dark": ("dark", 1280),
     "phone": ("light", 390),
 }
-PAGES = ["index", *HOW_TO, "notation", "kill-matrix", "practice", "atlas", "format", *(docname(chapter) for chapter in all_chapters())]
+PAGES = [
+    "index",
+    *HOW_TO,
+    "notation",
+    "kill-matrix",
+    "practice",
+    "atlas",
+    "format",
+    *(docname(chapter) for chapter in all_chapters()),
+]
 CHAPTERS = [page for page in PAGES if page.startswith("chapters/")]
 
 

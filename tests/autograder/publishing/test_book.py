@@ -390,7 +390,9 @@ def bare(tiny, tmp_path_factory):
         patch.setattr(
             book,
             "_stage_keys",
-            lambda chapters, with_solutions: dict.fromkeys(("ch98", "ch99", "kill-matrix", "practice", "atlas", "handed"), "tiny"),
+            lambda chapters, with_solutions: dict.fromkeys(
+                ("ch98", "ch99", "kill-matrix", "practice", "atlas", "handed"), "tiny"
+            ),
         )
         patch.setattr(book, "cache_folder", lambda: folder)
         patch.setattr(book, "STAGE", folder / "stage")
