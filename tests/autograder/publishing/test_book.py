@@ -335,6 +335,15 @@ def test_outputs_and_the_edition_make_a_chapter_anew_and_a_record_the_kill_matri
     assert {name for name, key in stage_keys().items() if key != before[name]} == {"ch98", "kill-matrix", "practice", "handed"}
 
 
+def test_a_record_of_another_library_makes_the_atlas_anew_alone(stage_keys, tmp_path, monkeypatch):
+    monkeypatch.setattr(book, "ATLAS", tmp_path / "atlas")
+    (tmp_path / "atlas" / "records").mkdir(parents=True)
+    (tmp_path / "atlas" / "not_run.yml").write_text("[]")
+    before = stage_keys()
+    (tmp_path / "atlas" / "records" / "trl.json").write_text("{}")
+    assert {name for name, key in stage_keys().items() if key != before[name]} == {"atlas"}
+
+
 def test_a_part_of_the_stage_is_made_once_unless_it_must_not_be_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(book, "cache_folder", lambda: tmp_path)
     made = []
