@@ -102,7 +102,7 @@ def _section(records: Records, formula: Formula) -> str:
         f"(atlas-{formula.name.replace('_', '-')})=",
         f"### {formula.title}",
         "",
-        f"The book: {_shown(formula.ours)}",
+        f"{'The book' if formula.chapter else 'The usual form'}: {_shown(formula.ours)}",
         "",
         ":::{div} atlas-rows",
         "",
@@ -122,18 +122,18 @@ def _line(record: Mapping[str, Any], row: Mapping[str, Any], formula: Formula) -
     near = "" if row["tolerance"] == TOLERANCE else f" to {row['tolerance']:g}"
     rule = f"equal{near}" if row["equal"] else _sentences(formula)[row["rule"]]
     rule += f". {row['note']}" if row["equal"] and row["note"] else f" {row['note']}"
-    cells = [f"{library}{_in_brackets(row['setting'])}", _difference(row["numbers"], row["ours"]), _plain(rule)]
+    cells = [f"{library}{_in_brackets(row['setting'])}", _difference(row), _plain(rule)]
     return f"| {' | '.join(cells)} | `{row['call']}` in `{row['source']}`, {record['date'].replace('-', NO_BREAK)} |"
 
 
-def _difference(numbers: Any, ours: Any) -> str:
+def _difference(row: Mapping[str, Any]) -> str:
     """A row's numbers, or of many the one that is farthest from the book's."""
-    left, right = comparing.flat(numbers), comparing.flat(ours)
+    left, right = comparing.flat(row["numbers"]), comparing.flat(row["ours"])
     if len(left) <= FEW:
         return _shown(left)
-    alike = sum(comparing.same(a, b) for a, b in zip(left, right, strict=True))
-    if alike == len(left):
+    if row["equal"]:
         return f"all {len(left)} the same"
+    alike = sum(comparing.same(a, b, row["tolerance"]) for a, b in zip(left, right, strict=True))
     at = max(range(len(left)), key=lambda place: abs(left[place] - right[place]))
     return f"{alike} of {len(left)} the same; farthest off {_number(left[at])} for {_number(right[at])}"
 
@@ -159,7 +159,7 @@ def _libraries(records: Records) -> str:
     for record in records.values():
         rows = record["rows"]
         cells = [" ".join(record["versions"]), " ".join(record["versions"].values()), record["date"], str(len(rows))]
-        cells += [str(sum(row["equal"] for row in rows)), record["why"]]
+        cells += [str(sum(row["equal"] for row in rows)), record["why"] or "Its functions and methods are called."]
         lines.append(f"| {' | '.join(map(_plain, cells))} |")
     return "\n".join(lines)
 
