@@ -7,7 +7,6 @@ of JSON for the runner; what a library itself prints goes to standard error, so 
 from __future__ import annotations
 
 import ast
-import inspect
 import json
 import os
 import sys
@@ -86,8 +85,11 @@ def _source(lines, node):
 
 
 def _text(path):
-    with open(path, encoding="utf-8") as file:
-        return file.read()
+    try:
+        with open(path, encoding="utf-8") as file:
+            return file.read()
+    except FileNotFoundError:
+        raise LookupError(f"{str(path).rpartition('site-packages/')[2]}: this version has no such file") from None
 
 
 def installed(package, *parts):
@@ -98,9 +100,3 @@ def installed(package, *parts):
     if spec is None or not spec.submodule_search_locations:
         raise LookupError(f"{package} is not installed")
     return os.path.join(next(iter(spec.submodule_search_locations)), *parts)
-
-
-def lines_of(thing):
-    """The source file of a function or class, relative to site-packages."""
-    path = inspect.getsourcefile(thing) or ""
-    return path.rpartition("site-packages" + os.sep)[2].replace(os.sep, "/")

@@ -85,5 +85,7 @@ def test_what_a_library_no_longer_has_is_named(run, call):
 
 
 def test_what_is_not_installed_is_named(run):
+    done = run("from sheet import function\nfunction('a/site-packages/lib/gone.py', 'f', {})\n")
+    assert done.stderr.splitlines()[-1] == "LookupError: lib/gone.py: this version has no such file"
     done = run("from sheet import installed\ninstalled('no_such_package', 'a.py')\n")
     assert done.stderr.splitlines()[-1] == "LookupError: no_such_package is not installed"
