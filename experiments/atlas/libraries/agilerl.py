@@ -62,5 +62,5 @@ self.whiten_advantages = True
 _, advantages = token_gae(self, *rollout, given.gae_lambda)
 row(
     "whitened_token_gae", torch.where(mask, advantages, 0), "PPO._compute_gae_returns_token", "agilerl/algorithms/ppo_llm.py",
-    "whiten_advantages=True",
+    "whiten_advantages=True, the default",
 )  # fmt: skip

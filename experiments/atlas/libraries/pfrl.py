@@ -1,6 +1,6 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["numpy==2.4.6", "torch==2.13.0", "pfrl==0.4.0"]
+# dependencies = ["numpy==2.4.6", "torch==2.13.0", "packaging==26.4", "pfrl==0.4.0"]
 #
 # [tool.atlas]
 # libraries = ["pfrl"]
