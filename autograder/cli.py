@@ -432,6 +432,42 @@ def _state(name: str, folder: Path) -> str:
 
 
 @app.command()
+def atlas(
+    libraries: Annotated[
+        list[str] | None, typer.Argument(metavar="[LIBRARY]…", help="As in stable-baselines3; without any, all of them.")
+    ] = None,
+    newer: Annotated[
+        bool,
+        typer.Option("--newer", help="Try the newest versions, and say what has changed since the record; nothing is written."),
+    ] = False,
+    environments: Annotated[
+        Path | None,
+        typer.Option(help="Keep the environments in this folder, and use them again; by default each goes when it has served."),
+    ] = None,
+) -> None:
+    """Compute what other libraries make of the atlas's input, each in an environment of its own, and write their records.
+
+    Exit status: 0 all computed, 1 some numbers follow no known rule, 2 bad input, 3 a library can't be installed or run.
+    """
+    from experiments.atlas import runner
+
+    known = runner.names()
+    if unknown := [name for name in libraries or () if name not in known]:
+        _stop(f"no library {unknown[0]!r} in the atlas; there are: {', '.join(known)}")
+    failed = unexplained = 0
+    for name in dict.fromkeys(libraries or known):
+        outcome = runner.run(name, newer, environments)
+        failed += bool(outcome.error)
+        unexplained += bool(outcome.unexplained)
+        for line in runner.told(outcome):
+            (err if outcome.error else Console(highlight=False, soft_wrap=True)).print(line, markup=False)
+    if failed:
+        _stop(f"{failed} of the libraries could not be run; their records are as they were", BROKEN)
+    if unexplained:
+        _stop("some numbers are neither the course's nor made by a rule of experiments/atlas/given.py", LOW_SCORES)
+
+
+@app.command()
 def prove(
     only: Annotated[list[str] | None, typer.Option(help="Of this chapter only, as in --only ch44; may be repeated.")] = None,
     exercise: Annotated[list[str] | None, typer.Option(help="This exercise, kept or not; may be repeated.")] = None,

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
 
 BOOK = ROOT / "book"
 STAGE = BOOK / "_stage"
+ATLAS = ROOT / "experiments" / "atlas"
 PUBLISHED = ("*.html", "llms.txt", "searchindex.js", "_static/*", "_images/*", "_downloads/*")
 JUPYTER_BOOK = """
 import json, sys
@@ -62,7 +63,7 @@ from jupyter_book.cli.main import main
 main(json.loads(sys.stdin.read()))
 """
 HOW_TO = ("how-to/learners", "how-to/teachers", "how-to/platforms", "how-to/contributors")
-APPENDICES = ("cheat-sheet", "notation", "kill-matrix", "practice", "autograd", "format")
+APPENDICES = ("cheat-sheet", "notation", "kill-matrix", "practice", "atlas", "autograd", "format")
 MATHJAX = ("tex-chtml-full.js", "output/chtml/fonts/**/*", "a11y/*", "sre/**/*")
 
 __all__ = ["BookError", "build", "docname", "executed_outputs"]
@@ -123,6 +124,7 @@ def staged_files(chapters: list[Chapter], with_solutions: bool) -> dict[str, byt
     files["cheat-sheet.md"] = cheat_sheet.page(chapters, files).encode()
     files |= _kept("staged-kill-matrix", keys["kill-matrix"], functools.partial(_staged_kill_matrix, chapters))
     files |= _kept("staged-practice", keys["practice"], functools.partial(_staged_practice, chapters))
+    files |= _kept("staged-atlas", keys["atlas"], _staged_atlas)
     others = {name: files[f"{name}.md"].decode() for name in (*HOW_TO, *APPENDICES)}
     files["llms.txt"] = front_page.llms_txt(chapters, others).encode()  # which Sphinx does not look at
     return files | assets() | practice_files(chapters, files, with_solutions, keys)
@@ -157,6 +159,13 @@ def _staged_practice(chapters: list[Chapter]) -> tuple[dict[str, bytes], bool]:
     return {"practice.md": practice_page(judged).encode()}, proved
 
 
+def _staged_atlas() -> tuple[dict[str, bytes], bool]:
+    """What other libraries compute, from the records of experiments/atlas."""
+    from autograder.publishing import atlas_page  # loads torch, for the book's own numbers
+
+    return atlas_page.staged(), True
+
+
 def _kept(name: str, key: str, make: Callable[[], tuple[dict[str, bytes], bool]]) -> dict[str, bytes]:
     """The texts, by path, that `make` returns, and keeps if it says so: made now, or by a build with the same key."""
     path = cache_folder() / f"{name}-{key}.json"
@@ -188,6 +197,7 @@ def _stage_keys(chapters: list[Chapter], with_solutions: bool) -> dict[str, str]
     return keys | {
         "kill-matrix": content_hash([common, *titles], records),
         "practice": content_hash([judging, *titles], [BOOK / "practice.md"]),
+        "atlas": content_hash([common], [BOOK / "atlas.md", *atlas_records()]),
         "clip": content_hash([common], sorted((ROOT / "course_lib" / "static").glob("explorer.*"))),
         **handed,
     }
@@ -446,7 +456,14 @@ def _build_key(chapters: list[Chapter], with_solutions: bool) -> str:
     more of the code than their outputs rest on, and rendering them again is quick."""
     own = [path for path in BOOK.rglob("*") if path.is_file() and not path.relative_to(BOOK).parts[0].startswith("_")]
     code = [path for folder in ("autograder", "course_lib", "solutions") for path in (ROOT / folder).rglob("*.py")]
-    kept = [*kept_records(), *front_page.LANDING.values(), ROOT / "requirements.txt", ROOT / "constraints.txt"]
+    code += ATLAS.glob("*.py")
+    kept = [
+        *kept_records(),
+        *atlas_records(),
+        *front_page.LANDING.values(),
+        ROOT / "requirements.txt",
+        ROOT / "constraints.txt",
+    ]
     chapters_own = [chapter.path for chapter in chapters]
     outputs = [execution_key(chapter) for chapter in chapters]
     return content_hash(
@@ -457,6 +474,11 @@ def _build_key(chapters: list[Chapter], with_solutions: bool) -> str:
 def kept_records() -> list[Path]:
     """The files of autograder.proving.kept and .practice, which this module does not import, as they load torch."""
     return sorted((ROOT / "autograder" / "proving" / "records").rglob("*.json"))
+
+
+def atlas_records() -> list[Path]:
+    """What `course atlas` has written, and the list of what it cannot run."""
+    return [*sorted((ATLAS / "records").glob("*.json")), ATLAS / "not_run.yml"]
 
 
 def _is_current(out: Path, key: str) -> bool:

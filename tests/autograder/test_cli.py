@@ -132,3 +132,35 @@ def test_what_was_not_understood_is_named_and_has_an_exit_status_of_its_own(
     monkeypatch.setattr(exports, "table", lambda _results: "")
     result = run("grade", tmp_path, *arguments)
     assert result.exit_code == status and "course: not understood: ada/ch44.ipynb: a notebook outside" in result.output
+
+
+def outcome(name, error="", rule="half"):
+    from experiments.atlas.runner import Outcome
+
+    row = {"formula": "value_loss", "setting": "", "equal": False, "rule": rule}
+    return Outcome(name, None if error else {"versions": {name: "1.0"}, "rows": [row]}, error)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "failing", "rule", "status", "said"),
+    [
+        (["trl", "verl", "trl"], (), "half", 0, ["trl 1.0: 0 of 1 rows", "verl 1.0: 0 of 1 rows"]),
+        (["trl", "verl"], ("trl",), "half", 3, ["trl: yanked", "verl 1.0", "1 of the libraries could not be run"]),
+        (["trl"], (), "", 1, ["by no known rule: value_loss", "neither the course's nor made by a rule"]),
+        (["nonsense"], (), "half", 2, ["no library 'nonsense' in the atlas; there are: agilerl, "]),
+    ],
+)
+def test_the_atlas_goes_on_where_a_library_fails_and_its_status_tells(monkeypatch, arguments, failing, rule, status, said):
+    from experiments.atlas import runner
+
+    ran = []
+
+    def run(name, newer, environments):
+        ran.append(name)
+        return outcome(name, "yanked" if name in failing else "", rule)
+
+    monkeypatch.setattr(runner, "run", run)
+    monkeypatch.setattr(cli, "err", cli.Console(highlight=False, soft_wrap=True, width=500))
+    result = CliRunner().invoke(cli.app, ["atlas", *arguments])
+    assert result.exit_code == status and all(line in result.output for line in said)
+    assert ran == ([] if status == 2 else list(dict.fromkeys(arguments)))

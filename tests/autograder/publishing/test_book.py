@@ -259,6 +259,7 @@ def test_table_of_contents_comes_from_the_front_matter(tiny):
         "notation",
         "kill-matrix",
         "practice",
+        "atlas",
         "autograd",
         "format",
     ]
@@ -346,6 +347,15 @@ def test_outputs_and_the_edition_make_a_chapter_anew_and_a_record_the_kill_matri
     }
 
 
+def test_a_record_of_another_library_makes_the_atlas_anew_alone(stage_keys, tmp_path, monkeypatch):
+    monkeypatch.setattr(book, "ATLAS", tmp_path / "atlas")
+    (tmp_path / "atlas" / "records").mkdir(parents=True)
+    (tmp_path / "atlas" / "not_run.yml").write_text("[]")
+    before = stage_keys()
+    (tmp_path / "atlas" / "records" / "trl.json").write_text("{}")
+    assert {name for name, key in stage_keys().items() if key != before[name]} == {"atlas"}
+
+
 def test_a_part_of_the_stage_is_made_once_unless_it_must_not_be_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(book, "cache_folder", lambda: tmp_path)
     made = []
@@ -401,7 +411,7 @@ def bare(tiny, tmp_path_factory):
         patch.setattr(
             book,
             "_stage_keys",
-            lambda chapters, with_solutions: dict.fromkeys(("ch98", "ch99", "kill-matrix", "practice", "clip"), "tiny"),
+            lambda chapters, with_solutions: dict.fromkeys(("ch98", "ch99", "kill-matrix", "practice", "atlas", "clip"), "tiny"),
         )
         patch.setattr(book, "cache_folder", lambda: folder)
         patch.setattr(book, "STAGE", folder / "stage")
@@ -434,6 +444,7 @@ def test_only_pages_and_what_they_show_is_published(bare):
         "notation.html",
         "kill-matrix.html",
         "practice.html",
+        "atlas.html",
         "autograd.html",
         "format.html",
         "search.html",

@@ -1,0 +1,1 @@
+"""What other libraries compute on one input, beside the course: the input, a script for each library, and their records."""
