@@ -76,7 +76,8 @@ _PARTS = """
 {% macro exercise(stub) %}Exercise {{ stub.number }}: {{ stub.title }} (<code>{{ stub.name | breakable }}</code>){% endmacro %}
 {% macro table(label, wide=true) %}<div class="table{{ " wide" if wide }}" role="region" aria-label="{{ label }}" tabindex="0"><table>
 {{ caller() }}</table></div>{% endmacro %}
-{% macro mistakes(found, of_chapter) %}<ol class="mistakes">
+{% macro mistakes(found, of_chapter) %}<p class="small">How many students made each, and what they read about it.</p>
+<ol class="mistakes">
 {% for one in found %}<li><span class="count">{{ one.students }}</span>
 <div><p class="say">{{ one.message | coded }}</p>
 <p class="small">{{ of_chapter.get(one.stubs[0].name, "") }}\
@@ -102,7 +103,6 @@ So many seldom share a slip: look at the release, or at the grader, first.</p>{%
 {{ levels[each.stub.level] }}.</li>{% endfor %}{% endfor %}</ul>
 {% elif seen %}<p>No exercise is too hard: of those who tried one, at least half have all its points.</p>{% endif %}
 {% if top %}<h3>The most common mistakes</h3>
-<p class="small">How many students made it, and what they read about it.</p>
 {{ mistakes(top, chapters_of) }}
 {% elif seen %}<p>No mistake that has a name is common.</p>{% endif %}
 {% if course | length > 1 %}<h3>Chapters</h3>
@@ -138,13 +138,13 @@ grade again.</p>{% endif %}
 {% endcall %}</div>
 <h3>Exercises</h3>
 {{ legend() }}
+<p class="small">Notebooks by outcome. What needs the lecture comes first.</p>
 {% call table("Exercises of " ~ one.assignment.name) %}
-<caption>Notebooks by outcome; what needs the lecture comes first.</caption>
 <thead><tr><th scope="col">Exercise</th><th scope="col">Outcome</th>{% for words in outcomes.values() %}\
 <th scope="col" class="number">{{ words | capitalize }}</th>{% endfor %}<th scope="col" class="number">Points earned</th></tr></thead>
 <tbody>{% for each in one.exercises if each.notebooks %}<tr><th scope="row" class="exercise">{{ exercise(each.stub) }}<br>
 <span class="small">{{ levels[each.stub.level] }}, {{ each.stub.minutes | duration }}</span>
-{% if each.too_hard %}<br><span class="alarm">too hard: {{ each.solved | percent }} of those who tried</span>
+{% if each.too_hard %}<br><span class="alarm">too hard: solved by {{ each.solved | percent }} of those who tried</span>
 {% elif each.left_out %}<br><span class="alarm">left out by most</span>{% endif %}</th>
 <td class="picture">{{ each.counts | bar(few) }}</td>
 {% for key in outcomes %}<td class="number">{{ each.counts[key] | few(few) }}</td>{% endfor %}
