@@ -25,7 +25,7 @@ from autograder.authoring.contract import sources as real_sources
 
 Outputs = Sequence[list[NotebookNode]]
 
-_LEVELS = {1: "●○○ (1 of 3)", 2: "●●○ (2 of 3)", 3: "●●● (3 of 3)"}
+LEVELS = {1: "●○○ (1 of 3)", 2: "●●○ (2 of 3)", 3: "●●● (3 of 3)"}
 _HEADING = re.compile(r"^(#{2,6}) (.+)$", re.MULTILINE)
 _ANSI = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 
@@ -203,7 +203,7 @@ def _introduced(text: str, stub: Cell, number: str, chapter: Chapter) -> str:
     if not headings:
         raise _unannounced(chapter, stub)
     last = headings[-1]
-    facts = f"`{stub.exercise}` · difficulty {_LEVELS[stub.difficulty]} · {duration(stub.minutes)}"
+    facts = f"`{stub.exercise}` · difficulty {LEVELS[stub.difficulty]} · {duration(stub.minutes)}"
     return f"{text[: last.start()]}{last[1]} Exercise {number}: {last[2]}\n\n{facts}{text[last.end() :]}"
 
 

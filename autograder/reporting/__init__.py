@@ -1,1 +1,1 @@
-"""From verdicts to people: the gradebook, the exports for learning platforms, and the reports."""
+"""From verdicts to people: the gradebook, the exports for learning platforms, the reports, and the pages on a class."""

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from autograder.grading import sources
 from autograder.grading.verdicts import FINAL, Verdict, read_all, write_atomically
 from autograder.reporting import collected, tables
+from autograder.reporting.class_page import class_pages
 from autograder.reporting.machines import gradescope_json, junit_xml, measured_times
 from autograder.reporting.people import same_files, summary_markdown, table
 from autograder.reporting.report import report_html
@@ -65,6 +66,9 @@ def write_all(directory: Path, gradebook: GradebookWriter, judged: Iterable[Verd
         given = marks.get(key, [])
         write_atomically(directory / "gradescope" / f"{name}.json", gradescope_json(verdict, given, penalties.get(key, 0.0)))
         write_atomically(directory / "report" / f"{name}.html", report_html(verdict, given))
+    people = {student: one.name for student, one in tables.who(rows, handed).items()}
+    for file, text in class_pages(verdicts, people).items():
+        write_atomically(directory / file, text)
     return verdicts
 
 
