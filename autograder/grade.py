@@ -108,13 +108,14 @@ def _write_all(
         gradebook,
     )
 
-    releases = {page.assignment: assemble.for_learners(page) for page in chapter.all_chapters()}
+    graded = {assignment for _, assignment, _ in tasks} & judge.assignments()
+    releases = {name: assemble.for_learners(chapter.load(name)) for name in sorted(graded)}
     gradebook.write_course(out, releases, db_url)
     folders = {(student, assignment): folder for student, assignment, folder in tasks}
     results = []
     with gradebook.GradebookWriter(db_url or _default_database(out)) as book:
-        for name in {assignment for _, assignment, _ in tasks} & releases.keys():
-            _register(book, name, releases[name], rules.rules.get(name))
+        for name, release in releases.items():
+            _register(book, name, release, rules.rules.get(name))
         for verdict, notebook in judged:
             handed_in, verdict = _handed_in(verdict, folders, rules)
             results.append(_write(verdict, notebook, out, book, releases, handed_in))

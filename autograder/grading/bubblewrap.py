@@ -77,6 +77,15 @@ def closure(requirements: Sequence[str]) -> dict[str, metadata.Distribution]:
     return found
 
 
+def _top_level(distribution: metadata.Distribution) -> set[str]:
+    """The first part of each path that a distribution has installed; "" of an absolute one."""
+    record = distribution.read_text("RECORD")
+    if record is None:
+        return {file.parts[0] if not file.is_absolute() else "" for file in distribution.files or ()}
+    # `distribution.files` would make an object of each of torch's ten thousand lines
+    return {line.lstrip('"').partition("/")[0].partition(",")[0] for line in record.splitlines()}
+
+
 @functools.cache
 def packages() -> dict[str, Path]:
     """Top-level names under /site → where they are installed. An installed `solutions` or `autograder` is not among them.
@@ -87,9 +96,8 @@ def packages() -> dict[str, Path]:
     if missing := [name for name in LEARNER_PACKAGES if Requirement(name).name not in found]:
         raise FileNotFoundError(f"{', '.join(missing)} not installed: run `pip install -r requirements.txt`")
     for distribution in found.values():
-        for file in distribution.files or ():
-            top = file.parts[0]
-            if top not in ("..", "/", "__pycache__") and not top.endswith(".pth"):
+        for top in _top_level(distribution):
+            if top not in ("", "..", "__pycache__") and not top.endswith(".pth"):
                 tops[top] = Path(str(distribution.locate_file(top)))
     return {top: path for top, path in sorted(tops.items()) if path.exists()}
 
