@@ -68,6 +68,8 @@ def test_with_the_books_answers_a_page_draws_what_the_book_shows(assignment, mon
     found = [one for one in figures(assignment) if one.title in DRAWN[assignment]]
     assert {one.title: one.uses for one in found} == DRAWN[assignment]
     outputs = [cell for one in found for cell in output(by_torch(one, assignment))]
+    names = [series["name"] for of in drawing.recorded(outputs).values() for series in of["series"]]
+    assert not any("yours" in name for name in names)  # which the page says of what it draws over them
     assert drawing.reasons(chapters.load(assignment), found, outputs) == dict.fromkeys(DRAWN[assignment], "")
 
 
@@ -112,7 +114,7 @@ def test_a_figure_that_the_page_draws_otherwise_is_refused():
         figure, "ch43", clipped_surrogate_loss=lambda new, old, advantages, clip_range: -advantages.mean() * 2 * new.mean()
     )
     reasons = drawing.reasons(chapters.load("ch43"), [figure], output(html))
-    assert reasons == {CLIP: "objective clipped is another curve on the page at +1, 0"}
+    assert reasons == {CLIP: "objective clipped is another curve on the page at -1, 0"}
 
 
 @pytest.mark.parametrize(
