@@ -147,6 +147,8 @@ def reasons(chapter: Chapter, found: Sequence[Figure], outputs: Iterable[Sequenc
 def drawn_by(chapter: Chapter, found: Sequence[Figure], factor: float = 0.5) -> dict[str, list[list[str]]]:
     """By title, of each series of a figure, the exercises that it draws: those of which `factor` times the answer moves it, at any end or
     middle of the sliders."""
+    if not found:
+        return {}
     answers = practice.answers(chapter)
     calls = [
         (one.title, positions, {name: answers[name] + SCALED.format(name=name, factor=factor)} if name else {})
