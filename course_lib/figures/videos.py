@@ -131,7 +131,7 @@ def _figure(path: Path, alt: str, caption: str) -> str:
         f'<video controls muted playsinline preload="none" width="{width}" height="{height}" '
         f'style="width:100%;max-width:{width}px;height:auto" poster="{_uri(path.with_suffix(".webp"), "image/webp")}" '
         f'aria-label="{label}"><source src="{_uri(path, "video/mp4")}" type="video/mp4"></video>'
-        f'{under}<p>{label}</p></figure>'
+        f"{under}<p>{label}</p></figure>"
     )
 
 
