@@ -184,8 +184,8 @@ UNWRITTEN = "compute_gae returns, which is not written yet: write it, then draw 
             "There is no curve of yours, as the figure can't use what compute_gae returns: None.",
         ),
         (
-            HEAD + "    return (rewards, 1.0)",
-            "There is no curve of yours, as the figure can't use what compute_gae returns: a tuple (a tensor of shape (16, 1), a float).",
+            HEAD + "    return (rewards, None)",
+            "There is no curve of yours, as the figure can't use what compute_gae returns: a tuple (a tensor of shape (16, 1), None).",
         ),
     ],
 )
