@@ -32,6 +32,15 @@ page, calls = json.load(sys.stdin)
 judge.open_page(json.dumps(page))
 json.dump([judge.draw(*call) for call in calls], sys.stdout)
 """
+SCALED = """
+
+right_of_{name} = {name}
+
+
+def {name}(*given, **named):
+    found = right_of_{name}(*given, **named)
+    return tuple({factor} * one for one in found) if isinstance(found, tuple) else {factor} * found
+"""
 PAYLOAD = re.compile(r'<figcaption>(.*?)</figcaption>.*?<script type="application/json">(.*?)</script>', re.DOTALL)
 LAST_DIGIT = 1.01e-3  # one unit in the fourth significant digit of 1.000, where it weighs most
 NOTHING = 1e-6  # of a series' largest value: what single precision makes of 0
@@ -133,6 +142,44 @@ def reasons(chapter: Chapter, found: Sequence[Figure], outputs: Iterable[Sequenc
     settings = {one.title: _settings(book[one.title]) for one in found}
     rows = iter(draw(chapter, found, [(title, positions) for title, all_of_it in settings.items() for positions, _ in all_of_it]))
     return {title: _differs(book[title], list(itertools.islice(rows, len(all_of_it)))) for title, all_of_it in settings.items()}
+
+
+def drawn_by(chapter: Chapter, found: Sequence[Figure], factor: float = 0.5) -> dict[str, list[list[str]]]:
+    """By title, of each series of a figure, the exercises that it draws: those of which `factor` times the answer moves it, at any end or
+    middle of the sliders."""
+    if not found:
+        return {}
+    answers = practice.answers(chapter)
+    calls = [
+        (one.title, positions, {name: answers[name] + SCALED.format(name=name, factor=factor)} if name else {})
+        for one in found
+        for name in ("", *one.uses)
+        for positions in _corners(one)
+    ]
+    rows = iter(draw(chapter, found, calls))
+    drawn = dict[str, list[list[str]]]()
+    for one in found:
+        number = len(_corners(one))
+        right, *others = [list(itertools.islice(rows, number)) for _ in ("", *one.uses)]
+        drawn[one.title] = [
+            [name for name, rows_of in zip(one.uses, others, strict=True) if _moved(right, rows_of, at)]
+            for at in range(len(right[0]["values"]))
+        ]
+    return drawn
+
+
+def _corners(figure: Figure) -> list[list[int]]:
+    """Positions of the sliders: each at its first, middle or last value."""
+    (call,) = [
+        node for node in ast.walk(ast.parse(figure.source)) if isinstance(node, ast.Call) and ast.unparse(node.func) == "explore"
+    ]
+    sizes = [len(ast.literal_eval(one.value)) for one in call.keywords if isinstance(one.value, ast.List)]
+    return [list(places) for places in itertools.product(*(sorted({0, size // 2, size - 1}) for size in sizes))]
+
+
+def _moved(right: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]], series: int) -> bool:
+    """Whether a series is another curve anywhere."""
+    return any(not same(b["values"][series], a["values"][series]) for a, b in zip(right, other, strict=True))
 
 
 def draw(

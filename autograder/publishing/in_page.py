@@ -98,8 +98,9 @@ def staged(pages: Sequence[tuple[Chapter, Mapping[str, Any]]], notebooks: Mappin
 
 
 def handed_to(chapter: Chapter, outputs: assemble.Outputs, with_solutions: bool) -> dict[str, Any]:
-    """The `exercises` that a chapter's page offers, by title the `figures` that draw some of them, with their names, and the `text` that
-    its judge is given: without the book's answers, if they are not to be shown; "" if it offers none.
+    """The `exercises` that a chapter's page offers; by title the `figures` that draw some of them: those that each `uses`, and for each
+    series those that it is `drawn` by; and the `text` that its judge is given: without the book's answers, if they are not to be shown;
+    "" if it offers none.
 
     Args:
       chapter: a line says which of its figures call exercises that are offered, but can't be drawn in the page.
@@ -115,6 +116,7 @@ def handed_to(chapter: Chapter, outputs: assemble.Outputs, with_solutions: bool)
         if reason:
             print(f"{chapter.assignment}: {title!r} is not drawn with the reader's code: {reason}", flush=True)
     drawn = [one for one in found if not reasons[one.title]]
+    by = drawing.drawn_by(chapter, drawn)
     if text:
         data = json.loads(text)
         data["page"]["figures"] = drawing.told(drawn)
@@ -122,7 +124,11 @@ def handed_to(chapter: Chapter, outputs: assemble.Outputs, with_solutions: bool)
             for page in (data["page"], *data["page"]["earlier"].values()):
                 page["answers"] = {}
         text = json.dumps(data, ensure_ascii=False)
-    return {"exercises": names, "figures": {one.title: list(one.uses) for one in drawn}, "text": text}
+    return {
+        "exercises": names,
+        "figures": {one.title: {"uses": list(one.uses), "drawn": by[one.title]} for one in drawn},
+        "text": text,
+    }
 
 
 def script(name: str, content: bytes) -> bytes:

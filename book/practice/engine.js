@@ -74,10 +74,11 @@ class Engine {
   }
 }
 
-let engine, asking = Promise.resolve();
+let engine, started = false, asking = Promise.resolve();
 
 // The verdict on an answer to one of the chapter's exercises; of several that are asked for, one after the other.
-// `others` has the reader's answers to other exercises, which this one may call; `told` is called with "starting" and "running".
+// `others` has the reader's answers to other exercises, which this one may call; `told` is called with a sentence while Python
+// starts, and with "" when the answer runs.
 export const check = (chapter, name, source, others = {}, told = () => {}) => ask(chapter, "check", [name, source, others], told);
 
 // What a figure shows of the reader's answers: values, or a sentence that says why there are none. Likewise one after the other.
@@ -93,14 +94,15 @@ function ask(chapter, task, given, told) {
 }
 
 async function one(chapter, task, given, told) {
-  told(engine?.runs ? "running" : "starting");
+  told(engine?.runs ? "" : started ? "Starting Python again …" : "Starting Python, once for this visit: it takes some seconds …");
+  started = true;
   engine ??= new Engine(chapter);
   const own = engine;
   let clock;
   try {
     await own.ready;
     own.runs = true;
-    told("running");
+    told("");
     clock = setTimeout(() => stop(`It did not finish within ${LIMIT / 1000} seconds. Is there a loop that never ends?`), LIMIT);
     return await own.ask(task, given);
   } catch (error) {

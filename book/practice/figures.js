@@ -12,10 +12,10 @@ export class Mine {
   #busy = false;
   #ahead = true; // whether to draw what is not shown yet
 
-  // `uses` has the exercises that the figure calls, `drafts` gives the reader's answers by name.
-  constructor(figure, {assignment, title, uses, drafts, element}) {
+  // `uses` has the exercises that the figure calls, `drawn` of each series those that draw it; `drafts` gives the reader's answers by name.
+  constructor(figure, {assignment, title, uses, drawn, drafts, element}) {
     this.#figure = figure;
-    this.#given = {assignment, title, uses, drafts};
+    this.#given = {assignment, title, uses, drawn, drafts};
     this.#said = element("span", {id: `practice-mine-${title.replace(/\W+/g, "-")}`, role: "status"});
     this.#box = element("input", {type: "checkbox", disabled: true, onchange: () => this.again()});
     this.#box.setAttribute("aria-describedby", this.#said.id);
@@ -32,7 +32,8 @@ export class Mine {
     this.#box.disabled = !uses.some((name) => name in own);
     if (this.#box.disabled && this.#box.checked) this.#off();
     if (this.#box.disabled) this.#say(`First write ${uses.join(" or ")} on this page.`);
-    else if (!this.#box.checked && this.#said.textContent.startsWith("First write ")) this.#say("");
+    else if (this.#box.checked) this.#tell();
+    else if (this.#said.textContent.startsWith("First write ")) this.#say("");
   }
 
   // The switch was used, or the answers may have changed.
@@ -41,7 +42,8 @@ export class Mine {
     if (answers !== this.#answers) this.#kept.clear();
     this.#answers = answers;
     this.#ahead = true;
-    if (!this.#box.checked) this.#say("");
+    if (!this.#box.disabled) this.#say("");
+    if (!this.#box.checked) this.#halt.hidden = true;
     this.#figure.explorer.draw();
   }
 
@@ -49,10 +51,15 @@ export class Mine {
   #mine(positions) {
     this.#now = positions;
     if (!this.#box.checked) return null;
-    const here = this.#kept.get(String(positions));
-    if (here) this.#say(here.sentence);
+    this.#tell();
     this.#ask();
-    return here?.values ?? null;
+    return this.#kept.get(String(positions))?.values ?? null;
+  }
+
+  // What there is to say of the picture, which an edit leaves as it is.
+  #tell() {
+    const here = this.#kept.get(String(this.#now)), edited = JSON.stringify(this.#given.drafts()) !== this.#answers;
+    if (here) this.#say(`${edited ? "From before your last edit; a check draws anew. " : ""}${here.sentence}`);
   }
 
   // What is to be drawn next: what the figure shows, then what is one step of a slider away.
@@ -78,14 +85,14 @@ export class Mine {
     const {assignment, title} = this.#given, answers = this.#answers, shown = () => String(positions) === String(this.#now);
     let words = "Drawing …", told;
     const tell = () => {
-      if (!shown()) return;
+      if (!shown() || !this.#box.checked) return;
       this.#halt.hidden = false;
       this.#say(words);
     };
     const clock = setInterval(tell, SLOW);
     try {
-      told = await draw(assignment, title, positions, JSON.parse(answers), (state) => {
-        words = state === "starting" ? "Starting Python, once for this visit: it takes some seconds …" : "Drawing …";
+      told = await draw(assignment, title, positions, JSON.parse(answers), (start) => {
+        words = start || "Drawing …";
       });
     } finally {
       clearInterval(clock);
@@ -94,24 +101,27 @@ export class Mine {
     }
     if (answers !== this.#answers) return;
     this.#ahead &&= !told.ended;
+    if (told.ended && !this.#box.checked) return;
     if (told.ended && shown()) return this.#off(told.sentence);
-    this.#kept.set(String(positions), this.#fitting(positions, told));
+    this.#kept.set(String(positions), this.#fitting(positions, told, JSON.parse(answers)));
     if (shown()) this.#figure.explorer.draw();
   }
 
-  // What was drawn, with a sentence on it; only a sentence where the figure has no room for it.
-  #fitting(positions, {values, sentence}) {
+  // Of what was drawn, the series that the answers draw, with a sentence on them; only a sentence where the figure has no room for it.
+  #fitting(positions, {values, sentence}, answers) {
     if (sentence) return {sentence};
     const {data} = this.#figure.explorer, wrong = data.series.findIndex(({x}, i) => x.length !== values[i].length);
     if (wrong >= 0) {
       const {name, x} = data.series[wrong];
       return {sentence: `There is no curve of yours: “${name}” has ${values[wrong].length} values, and the figure draws ${x.length}.`};
     }
-    return {values, sentence: compared(data, values, data.values[positions.reduce((at, to, i) => at * data.sliders[i].values.length + to, 0)])};
+    const own = values.map((one, i) => (this.#given.drawn[i].some((name) => name in answers) ? one : null));
+    return {values: own, sentence: compared(data, own, data.values[positions.reduce((at, to, i) => at * data.sliders[i].values.length + to, 0)])};
   }
 
   #off(sentence = "") {
     this.#box.checked = false;
+    this.#halt.hidden = true;
     this.#say(sentence);
     this.#figure.explorer.draw();
   }
@@ -121,9 +131,10 @@ export class Mine {
   }
 }
 
-// In words, what the picture shows beside the book's curves.
+// In words, what the picture shows beside the book's curves; `mine` has null for what is the book's alone.
 function compared(data, mine, book) {
   const differ = data.series.filter((_, i) => {
+    if (!mine[i]) return false;
     const nothing = 1e-6 * Math.max(0, ...book[i].map(Math.abs)); // Math.abs(null) is 0
     return book[i].some((right, j) => {
       const own = mine[i][j];

@@ -183,18 +183,48 @@ def draw(title: str, positions: list[int], answers: Mapping[str, str] | None = N
             if name in failed:
                 return {"values": [], "sentence": f"There is no curve of yours, as the cell of {name} stops: {failed[name]}"}
         missing.asked_for.clear()
+        returned = dict[str, Any]()
+        for name in {*figure["uses"]} & {*(answers or {})} & {*namespace}:
+            namespace[name] = _kept(namespace[name], name, returned)
         try:
             exec(compile(figure["source"], "<figure>", "exec", dont_inherit=True), namespace)
             values = figures.values(title, positions)
         except (Exception, SystemExit) as error:
-            return {"values": [], "sentence": _no_curve(error)}
+            return {"values": [], "sentence": _no_curve(error, returned)}
     if missing.asked_for:
         return {"values": [], "sentence": f"There is no curve of yours: {missing.asked_for[0]}."}
     return {"values": values, "sentence": ""}
 
 
-def _no_curve(error: BaseException) -> str:
-    """Why there is none, and what to do: as course_lib.figures.interactive says it."""
+def _kept(function: Callable, name: str, returned: dict[str, Any]) -> Callable:
+    """The function, which keeps in `returned` what it has returned last."""
+
+    def calling(*args: Any, **kwargs: Any) -> Any:
+        returned.pop(name, None)  # the last is the last to be called
+        returned[name] = function(*args, **kwargs)
+        return returned[name]
+
+    return calling
+
+
+def _said_of(value: Any) -> str:
+    """A value in words."""
+    if value is None:
+        return "None"
+    if isinstance(value, torch.Tensor):
+        return f"a tensor of shape {tuple(value.shape)}"
+    if isinstance(value, tuple):
+        return f"a tuple ({', '.join(map(_said_of, value))})"
+    kind = type(value).__name__
+    return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}"
+
+
+def _no_curve(error: BaseException, returned: Mapping[str, Any]) -> str:
+    """Why there is none, and what to do: as course_lib.figures.interactive says it.
+
+    Args:
+      returned: by name, what the reader's functions have returned last.
+    """
     if missing.asked_for:
         return f"There is no curve of yours: {missing.asked_for[0]}."
     frames = traceback.extract_tb(error.__traceback__)
@@ -205,7 +235,9 @@ def _no_curve(error: BaseException) -> str:
         return f"This figure needs {error.name}, which is not written yet: write it, then draw again."
     said = f"{type(error).__name__}: {error}"
     if not name:
-        return f"There is no curve of yours, as the figure can't use what your code returns: {said}."
+        odd = {one: value for one, value in returned.items() if not isinstance(value, torch.Tensor | tuple)} or returned
+        which = f"{[*odd][-1]} returns: {_said_of([*odd.values()][-1])}" if odd else f"your code returns: {said}"
+        return f"There is no curve of yours, as the figure can't use what {which}."
     return f"There is no curve of yours, as {name} stops: {said}. Its check says more."
 
 

@@ -15,7 +15,10 @@ function element(tag, properties = {}, ...children) {
   return made;
 }
 
-const button = (text, does) => element("button", {type: "button", onclick: does}, text);
+// While it is off, a button does nothing, but keeps the focus of who has pressed it.
+const button = (text, does) => element("button", {type: "button", onclick: ({currentTarget}) => off(currentTarget) || does()}, text);
+const off = (one) => one.getAttribute("aria-disabled") === "true";
+const turn = (one, on) => one.setAttribute("aria-disabled", String(!on));
 
 const cells = [...document.querySelectorAll('div.cell[class*="tag_exercise-"]')].map((cell) => {
   const name = [...cell.classList].find((one) => one.startsWith("tag_exercise-")).slice("tag_exercise-".length);
@@ -38,8 +41,8 @@ Object.assign(window.coursePractice, {
 
 const drafts = () => Object.fromEntries([...answers.keys()].map((name) => [name, store.draft(name)]).filter(([, draft]) => draft !== null));
 const figures = [...document.querySelectorAll("figure.explorer")].flatMap((figure) => {
-  const title = figure.querySelector("figcaption").textContent, uses = chapter?.figures?.[title];
-  return uses ? [new Mine(figure, {assignment, title, uses, drafts, element})] : [];
+  const title = figure.querySelector("figcaption").textContent, of = chapter?.figures?.[title];
+  return of ? [new Mine(figure, {assignment, title, ...of, drafts, element})] : [];
 });
 
 // ---- an exercise ------------------------------------------------------------------------------------------------------
@@ -56,7 +59,8 @@ function Answer(cell, name) {
   const result = element("div", {className: "practice-result", role: "status"});
   for (const [one, does] of [[tried, "Check"], [halt, "Stop"], [reset, "Reset"]]) one.setAttribute("aria-label", `${does} ${name}`);
   write.setAttribute("aria-label", `Write your answer: ${name}`);
-  halt.disabled = reset.disabled = true;
+  reset.disabled = true;
+  turn(halt, false);
   cell.classList.add("practice");
   cell.append(help, element("div", {className: "practice-bar"}, write, tried, halt, reset), result);
   const reference = cell.nextElementSibling; // what the check says of the reference would be taken for a verdict
@@ -90,12 +94,11 @@ function Answer(cell, name) {
   }
 
   async function judge() {
-    if (tried.disabled) return;
-    tried.disabled = true;
-    halt.disabled = false;
+    if (off(tried)) return;
+    turn(tried, false);
+    turn(halt, true);
     result.setAttribute("aria-busy", "true");
-    const told = (state) => result.replaceChildren(element("p", {className: "practice-wait"},
-      state === "starting" ? "Starting Python, once for this visit: it takes some seconds …" : "Running …"));
+    const told = (start) => result.replaceChildren(element("p", {className: "practice-wait"}, start || "Running …"));
     try {
       const {[name]: _, ...others} = drafts();
       const verdict = await check(assignment, name, text(), others, told);
@@ -106,8 +109,8 @@ function Answer(cell, name) {
       result.replaceChildren(box(name, {state: "timeout", message: sorry}));
     }
     result.removeAttribute("aria-busy");
-    tried.disabled = false;
-    halt.disabled = true;
+    turn(tried, true);
+    turn(halt, false);
     progress();
     figures.forEach((figure) => figure.again());
   }

@@ -125,13 +125,13 @@ def _figure(path: Path, alt: str, caption: str) -> str:
     with Image.open(path.with_suffix(".webp")) as poster:
         width, height = poster.size
     label = html.escape(alt, quote=True)
-    under = f'<figcaption style="color:#222">{html.escape(caption)}</figcaption>' if caption else ""
+    under = f'<figcaption style="color:inherit">{html.escape(caption)}</figcaption>' if caption else ""
     return (
-        f'<figure style="margin:0;background:#fff;flex:1 1 {NARROWEST}px;max-width:{width}px">'
+        f'<figure style="margin:0;flex:1 1 {NARROWEST}px;max-width:{width}px">'
         f'<video controls muted playsinline preload="none" width="{width}" height="{height}" '
         f'style="width:100%;max-width:{width}px;height:auto" poster="{_uri(path.with_suffix(".webp"), "image/webp")}" '
         f'aria-label="{label}"><source src="{_uri(path, "video/mp4")}" type="video/mp4"></video>'
-        f'{under}<p style="color:#222">{label}</p></figure>'
+        f"{under}<p>{label}</p></figure>"
     )
 
 

@@ -1,5 +1,6 @@
 // Draws the precomputed series of one explorer and redraws when a slider or the width changes. No dependency, no request.
-// A page may set `figure.explorer.mine`: of the sliders' positions, values of the same series to draw over them, or null.
+// A page may set `figure.explorer.mine`: of the sliders' positions, values of the same series to draw over
+// them, null for those to leave alone; or null.
 ((figure) => {
   const data = JSON.parse(figure.querySelector("script[type='application/json']").textContent);
   const sliders = [...figure.querySelectorAll("input[type=range]")];
@@ -21,7 +22,7 @@
   const drawPanel = (svg, panel, values, mine) => {
     const width = Math.max(svg.parentElement.clientWidth, 260), height = 210;
     const [left, right, top, bottom] = [46, 8, 10, 40];
-    const reached = (mine ?? []).flatMap((one, i) => (panel.series.includes(i) ? one.filter((v) => v !== null) : []));
+    const reached = (mine ?? []).flatMap((one, i) => (one && panel.series.includes(i) ? one.filter((v) => v !== null) : []));
     const range = [Math.min(panel.y[0], ...reached), Math.max(panel.y[1], ...reached)];
     const margin = (range[1] - range[0]) / 20;
     if (range[0] < panel.y[0]) range[0] -= margin;
@@ -52,14 +53,14 @@
           make(svg, "circle", {class: `points c${index % 5} ${whose}`, cx: x(px), cy: y(py), r: series.kind === "line" ? 2.5 : 4});
       }
     };
-    panel.series.forEach((index) => paintSeries(index, values, mine ? "book" : ""));
-    if (mine) panel.series.forEach((index) => paintSeries(index, mine, "mine"));
+    const own = panel.series.filter((index) => mine?.[index]);
+    panel.series.forEach((index) => paintSeries(index, values, own.includes(index) ? "book" : ""));
+    own.forEach((index) => paintSeries(index, mine, "mine"));
     const told = (index, values, name) => {
       const kept = values[index].filter((v) => v !== null);
       return `${data.series[index].name}${name}: from ${short(Math.min(...kept))} to ${short(Math.max(...kept))}`;
     };
-    const all = panel.series.map((index) => told(index, values, ""));
-    if (mine) all.push(...panel.series.map((index) => told(index, mine, ", yours")));
+    const all = [...panel.series.map((index) => told(index, values, "")), ...own.map((index) => told(index, mine, ", yours"))];
     svg.setAttribute("aria-label", panel.label + ". " + all.join("; "));
   };
   const body = figure.querySelector("tbody"), rows = [...body.rows];
@@ -80,7 +81,7 @@
     body.querySelectorAll(".mine").forEach((row) => row.remove());
     rows.forEach((row, i) => {
       fill(row, values[i]);
-      if (!mine) return;
+      if (!mine?.[i]) return;
       const own = row.cloneNode(true);
       row.after(own);
       own.className = "mine";

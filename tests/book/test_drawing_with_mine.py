@@ -74,14 +74,19 @@ def test_the_switch_waits_for_something_to_draw_with(visit, name):
     assert not any("/practice/wasm.js" in url for url in visit.requests)
 
 
+def test_only_what_the_readers_code_draws_is_dashed(visit, name):
+    seen, _ = drawn_with(visit.page, RIGHT)
+    assert [row for row in seen["rows"] if row.endswith(", yours")] == ["advantage, yours"]
+    assert (seen["mine"], seen["pale"]) == (1, 1)
+
+
 def test_the_books_answer_draws_the_books_curve(visit, name):
     if the_figure(visit.page).get_by_label("Draw with mine").is_checked():
         the_figure(visit.page).get_by_label("Draw with mine").uncheck()
     book = the_figure(visit.page).evaluate(SEEN)
     seen, said = drawn_with(visit.page, RIGHT)
     assert said == "Yours is dashed, the book's is pale. Here they are the same."
-    for series in ("residual", "advantage"):
-        assert seen["rows"][f"{series}, yours"] == seen["rows"][series] == book["rows"][series]
+    assert seen["rows"]["advantage, yours"] == seen["rows"]["advantage"] == book["rows"]["advantage"]
     assert seen["mine"] and seen["pale"] and not book["mine"] and seen["axis"] == book["axis"]
 
 
@@ -128,11 +133,34 @@ def test_what_draws_nothing_says_so_and_the_books_curve_stays(visit, name, text,
     assert "advantage, yours" not in seen["rows"]
 
 
-def test_check_draws_again(visit, name):
-    drawn_with(visit.page, WRONG)
+def test_an_edit_is_told_until_a_check_draws_again(visit, name):
+    _, said = drawn_with(visit.page, WRONG)
     visit.page.evaluate(KEEP, ["compute_gae", RIGHT])
+    assert the_figure(visit.page).locator(SAID).inner_text() == f"From before your last edit; a check draws anew. {said}"
+    the_figure(visit.page).get_by_label("gae_lambda").press("ArrowRight")  # draws the old answer, and says so
+    the_figure(visit.page).get_by_text("From before your last edit").wait_for()
+    the_figure(visit.page).get_by_label("gae_lambda").press("ArrowLeft")
     visit.page.get_by_role("button", name="Check compute_gae").click()
     the_figure(visit.page).get_by_text("Here they are the same.").wait_for()
+    assert "edit" not in the_figure(visit.page).locator(SAID).inner_text()
+
+
+def test_switched_off_in_the_middle_it_says_nothing(browser, html, name):
+    with Visit(browser, html / f"{PAGE}.html") as visit:
+        figure = the_figure(visit.page)
+        visit.page.evaluate(KEEP, ["compute_gae", ENDLESS])
+        figure.get_by_label("Draw with mine").check()
+        figure.get_by_text("Starting Python, once for this visit").wait_for()
+        figure.get_by_text("Drawing …").wait_for()
+        figure.get_by_label("Draw with mine").uncheck()
+        visit.page.wait_for_timeout(1000)  # in which it would have said again that it draws
+        assert figure.locator(SAID).inner_text() == "" and not figure.get_by_role("button", name="Stop drawing").is_visible()
+        figure.get_by_label("Draw with mine").check()
+        figure.get_by_role("button", name="Stop drawing").click()
+        figure.get_by_text("You stopped it.").wait_for()
+        figure.get_by_label("Draw with mine").check()
+        assert figure.locator(SAID).inner_text() != "You stopped it."
+        assert "once for this visit" not in figure.locator(SAID).inner_text()
 
 
 def test_an_endless_loop_is_stopped_and_the_figure_lives_on(visit, name):

@@ -141,3 +141,20 @@ def test_the_prompt_for_a_tutor_is_short_and_has_a_button_that_copies_it(browser
             part in text for part in ("My attempt:", "What the check says:", "one hint", "Never write the exercise's code")
         )
         assert prompt.locator("button.copybtn").count() == 1
+
+
+def test_on_a_phone_no_name_in_a_table_is_broken(browser, html):
+    with Visit(browser, html / "notation.html", "phone") as visit:
+        names = "[...document.querySelectorAll('table.table td code .pre')]"
+        assert visit.page.evaluate(f"{names}.length")
+        assert (
+            visit.page.evaluate(f"{names}.filter((one) => one.getClientRects().length > 1).map((one) => one.textContent)") == []
+        )
+        assert visit.page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+@pytest.mark.parametrize("look", ["light", "phone"])
+def test_the_tutors_prompt_fits_its_box(browser, html, look):
+    with Visit(browser, html / "how-to/learners.html", look) as visit:
+        box = visit.page.locator("#a-tutor-that-does-not-give-it-away pre")
+        assert box.evaluate("pre => pre.scrollWidth <= pre.clientWidth")

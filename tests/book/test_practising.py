@@ -128,8 +128,10 @@ def test_an_endless_loop_is_stopped_and_the_page_lives_on(visit, name):
     write(visit.page, ENDLESS)
     visit.page.get_by_role("button", name="Check compute_gae").click()
     visit.page.get_by_text("Running …").wait_for()
-    visit.page.get_by_role("button", name="Stop compute_gae").click()
+    visit.page.get_by_role("button", name="Stop compute_gae").focus()
+    visit.page.keyboard.press("Enter")
     assert "You stopped it." in told(visit.page)
+    assert visit.page.evaluate("document.activeElement.getAttribute('aria-label')") == "Stop compute_gae"
     write(visit.page, RIGHT)
     assert verdict(visit.page).startswith("✓ Passed: compute_gae")
 
@@ -181,6 +183,9 @@ def test_the_keyboard_is_enough(visit, name):
     assert told(page).startswith("✓ Passed: compute_gae")
     page.keyboard.press("Escape")
     page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.getAttribute('aria-label')") == "Check compute_gae"
+    page.keyboard.press("Enter")
+    assert told(page).startswith("✓ Passed: compute_gae")
     assert page.evaluate("document.activeElement.getAttribute('aria-label')") == "Check compute_gae"
 
 

@@ -26,6 +26,7 @@ DRAWN = {
     },
     "ch45": {"What one action with advantage 1 asks of a Gaussian policy": ("gaussian_log_prob",)},
     "ch48": {"A Gaussian, squashed, and the correction of its log-density": ("squashed_gaussian_log_prob",)},
+    "ch51": {"What the first λ-return is made of": ("dreamer_lambda_returns",)},
     "ch80": {"A choice, its loss, and how hard it pulls": ("preference_probability", "bradley_terry_loss")},
     "ch97": {"What one pair asks for": ("dpo_loss", "ipo_loss")},
 }
@@ -67,7 +68,32 @@ def test_with_the_books_answers_a_page_draws_what_the_book_shows(assignment, mon
     found = [one for one in figures(assignment) if one.title in DRAWN[assignment]]
     assert {one.title: one.uses for one in found} == DRAWN[assignment]
     outputs = [cell for one in found for cell in output(by_torch(one, assignment))]
+    names = [series["name"] for of in drawing.recorded(outputs).values() for series in of["series"]]
+    assert not any("yours" in name for name in names)  # which the page says of what it draws over them
     assert drawing.reasons(chapters.load(assignment), found, outputs) == dict.fromkeys(DRAWN[assignment], "")
+
+
+@functools.cache
+def drawn_by(assignment: str, factor: float) -> dict[str, list[list[str]]]:
+    found = [one for one in figures(assignment) if one.title in DRAWN[assignment]]
+    return drawing.drawn_by(chapters.load(assignment), found, factor)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 0.5])
+@pytest.mark.parametrize("assignment", DRAWN)
+def test_no_figure_draws_an_answer_of_the_wrong_sign_or_scale_on_the_books_curves(assignment, factor):
+    moved = {title: {name for names in series for name in names} for title, series in drawn_by(assignment, factor).items()}
+    assert moved == {title: set(uses) for title, uses in DRAWN[assignment].items()}
+
+
+def test_a_pair_shows_a_forgotten_reference():
+    (figure,) = figures("ch97")
+    text = practice.answers(chapters.load("ch97"))["ipo_loss"]
+    wrong = text.replace("ref_chosen_logps.detach()", "0").replace("ref_rejected_logps.detach()", "0")
+    assert wrong != text
+    calls = [(figure.title, [2, 0], answers) for answers in ({}, {"ipo_loss": wrong})]
+    book, mine = drawing.draw(chapters.load("ch97"), [figure], calls)
+    assert [drawing.same(a, b) for a, b in zip(mine["values"], book["values"], strict=True)] == [True, False, True, False, True]
 
 
 def test_every_other_figure_that_calls_an_exercise_needs_what_a_page_lacks():
@@ -88,7 +114,7 @@ def test_a_figure_that_the_page_draws_otherwise_is_refused():
         figure, "ch43", clipped_surrogate_loss=lambda new, old, advantages, clip_range: -advantages.mean() * 2 * new.mean()
     )
     reasons = drawing.reasons(chapters.load("ch43"), [figure], output(html))
-    assert reasons == {CLIP: "objective clipped is another curve on the page at +1, 0"}
+    assert reasons == {CLIP: "objective clipped is another curve on the page at -1, 0"}
 
 
 @pytest.mark.parametrize(
@@ -155,7 +181,11 @@ UNWRITTEN = "compute_gae returns, which is not written yet: write it, then draw 
         ),
         (
             HEAD + "    return None",
-            "There is no curve of yours, as the figure can't use what your code returns: ",
+            "There is no curve of yours, as the figure can't use what compute_gae returns: None.",
+        ),
+        (
+            HEAD + "    return (rewards, None)",
+            "There is no curve of yours, as the figure can't use what compute_gae returns: a tuple (a tensor of shape (16, 1), None).",
         ),
     ],
 )

@@ -49,7 +49,10 @@ def test_each_page_is_given_its_cases_and_its_notebook(ready):
     files = staged()
     told = files["vendor/practice.js"].decode()
     index = json.loads(re.match(r"window\.coursePractice = \{index: (.*)\};\n", told)[1])
-    assert index["chapters"] == {"ch43": {"page": CHAPTER.page, "exercises": NAMES, "figures": {TITLE: NAMES}}}
+    drawn = [[], NAMES, [], NAMES]  # objective and gradient, unclipped and clipped
+    assert index["chapters"] == {
+        "ch43": {"page": CHAPTER.page, "exercises": NAMES, "figures": {TITLE: {"uses": NAMES, "drawn": drawn}}}
+    }
     assert list(json.loads(unpacked(files["vendor/practice/ch43.js"]))["page"]["cases"]) == NAMES
     assert unpacked(files["vendor/practice/ch43-notebook.js"]) == NOTEBOOKS["ch43"]
     assert files == staged()

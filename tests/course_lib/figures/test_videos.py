@@ -72,7 +72,8 @@ def test_the_page_gets_words_and_nothing_from_elsewhere(lander, monkeypatch):
     page = videos.to_html((path, 'It falls & "crashes".', "first"), (path, "It lands.", "last"))
     assert page.count("<video ") == 2 and "autoplay" not in page and page.count('preload="none"') == 2
     assert page.count("It falls &amp; &quot;crashes&quot;.") == 2, "as label and under the video"
-    assert '<figcaption style="color:#222">first</figcaption>' in page
+    assert '<figcaption style="color:inherit">first</figcaption>' in page
+    assert not re.search(r"#[0-9a-f]{3}\b", page), "colours of its own, which one of the themes would not suit"
     assert all(source.startswith("data:") for source in re.findall(r'(?:src|poster)="([^"]+)"', page))
     shown = []
     monkeypatch.setattr(IPython.display, "display", lambda data, raw: shown.append(data))
