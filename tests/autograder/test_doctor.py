@@ -73,6 +73,13 @@ def test_a_broken_sandbox_is_reported_with_its_remedy(monkeypatch):
     assert doctor._sandbox() == Check("sandbox", False, "no sandbox", "apt install bubblewrap")
 
 
+def test_a_sandbox_that_fails_once_works_and_the_failure_is_told(monkeypatch):
+    left = [[sandbox.Problem("import torch fails inside the sandbox: OSError", "")], []]
+    monkeypatch.setattr(sandbox, "probe", lambda torch: left.pop(0))
+    check = doctor._sandbox()
+    assert check.ok and "a first try failed: import torch fails inside the sandbox: OSError" in check.detail
+
+
 def test_a_missing_engine_is_reported(monkeypatch):
     monkeypatch.setattr("gymnasium.make", lambda *_, **__: 1 / 0)
     check = doctor._flights()
