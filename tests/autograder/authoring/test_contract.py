@@ -43,7 +43,7 @@ def test_the_tiny_chapter_keeps_its_contract(tiny):
         ('"open_question": "why_double"', '"open_question": "test_double"', "the id 'test_double' is taken"),
         ("import check, validate", "import check", "the reference of quadruple uses validate, which no set-up"),
         ("from course_lib import check, validate", "from (", "not Python"),
-        ("{eq}`third`", "{eq}`fourth`", r"ch99_tiny.md:41: no equation of this chapter is labelled 'fourth'"),
+        ("{eq}`third`", "{eq}`fourth`", r"ch99_tiny.md:42: no equation of this chapter is labelled 'fourth'"),
         ("(quadruple)", "(double)", "a second equation is labelled 'double'"),
     ],
 )
