@@ -24,6 +24,15 @@ def find(document, name):
     return next(cell for cell in document["cells"] if cell["metadata"].get("nbgrader", {}).get("grade_id") == name)
 
 
+def place(name, among_code=False):
+    """Which of the released notebook's cells has this mark, counted from 1."""
+    cells = [cell for cell in RELEASED["cells"] if cell["cell_type"] == "code" or not among_code]
+    return cells.index(find(RELEASED, name)) + 1
+
+
+TD, GAE_CHECK, ASKED = place("td_residuals", True), place("test_compute_gae", True), place(QUESTION)
+
+
 def edited(edit):
     document = copy.deepcopy(RELEASED)
     edit(document)
@@ -63,19 +72,27 @@ def unmarked(document):
 
 CASES = [
     (lambda document: None, "", ""),
-    (doubled("td_residuals"), "td_residuals", "td_residuals stands twice (code cells 3 and 4): the last definition counts."),
+    (
+        doubled("td_residuals"),
+        "td_residuals",
+        f"td_residuals stands twice (code cells {TD} and {TD + 1}): the last definition counts.",
+    ),
     (
         doubled("test_compute_gae"),
         "compute_gae",
-        "The check of compute_gae stands twice (code cells 6 and 7): the copies are ignored.",
+        f"The check of compute_gae stands twice (code cells {GAE_CHECK} and {GAE_CHECK + 1}): the copies are ignored.",
     ),
     (removed("test_compute_gae"), "compute_gae", "The check cell of compute_gae is missing: the grader puts it back."),
     (unmarked, "compute_gae", "The check cell of compute_gae has lost its mark: the grader puts it back."),
     (removed(QUESTION), QUESTION, f"The open question {QUESTION} has no cell with its mark"),
-    (doubled(QUESTION, "Other."), QUESTION, f"The open question {QUESTION} stands twice, with different texts (cells 67 and 68)"),
+    (
+        doubled(QUESTION, "Other."),
+        QUESTION,
+        f"The open question {QUESTION} stands twice, with different texts (cells {ASKED} and {ASKED + 1})",
+    ),
     (doubled(QUESTION), "", ""),
     (as_code, QUESTION, f"The open question {QUESTION} is in a code cell (code cell "),
-    (as_text, "lambda_returns", "lambda_returns is written in a text cell (cell 20), which never runs"),
+    (as_text, "lambda_returns", f"lambda_returns is written in a text cell (cell {place('lambda_returns')}), which never runs"),
     (without_marks, OUTLINE.exercises[0], "The cells have lost their marks"),
 ]
 
