@@ -11,7 +11,7 @@ from autograder.authoring.chapter import all_chapters
 from autograder.proving import practice
 from autograder.publishing.book import docname
 from tests.book import axe
-from tests.book.visit import OPEN, PAGES, Visit
+from tests.book.visit import OPEN, PAGES, STILL, Visit
 
 MORE_BEFORE_THE_FIRST_CLICK = 150_000  # bytes that the front page may add to a page of text
 FIRST, SECOND = all_chapters()[:2]
@@ -99,7 +99,7 @@ def test_the_reader_goes_on_where_something_is_begun_and_not_complete(practised)
 def test_with_progress_shown_no_rule_of_accessibility_is_broken(practised, theme):
     page = practised[0]
     page.emulate_media(color_scheme=theme)
-    page.wait_for_function("theme => document.documentElement.dataset.theme === theme", arg=theme)
+    page.evaluate(STILL, theme)  # colours change over some frames
     page.evaluate(OPEN)
     assert axe.grave(axe.violations(page)) == []
 
