@@ -19,6 +19,7 @@ from markupsafe import Markup, escape
 from autograder.authoring.assemble import LEVELS, duration
 from autograder.grading.verdicts import Verdict, clean_text
 from autograder.reporting.class_figures import FEW, OUTCOMES, TENTHS, Figures, Mistake, figures, ordered, people
+from autograder.reporting.report import HEAD
 
 COMMONEST = 5  # mistakes on top of the page
 ROWS = 300  # of a table of students
@@ -182,15 +183,8 @@ grade again.</p>{% endif %}
 
 _PAGE = (
     _PARTS
-    + """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" \
-content="default-src 'none'; style-src 'sha256-{{ style_hash }}'; base-uri 'none'; form-action 'none'">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="referrer" content="no-referrer">
-<title>{{ "The class, with names" if private else "The class" }}</title>
+    + HEAD
+    + """<title>{{ "The class, with names" if private else "The class" }}</title>
 <style>{{ style }}</style>
 </head>
 <body>

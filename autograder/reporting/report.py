@@ -68,7 +68,8 @@ pre { font: .9rem/1.45 ui-monospace, monospace; white-space: pre-wrap; unicode-b
 @media (max-width: 30rem) { body { padding: 1rem .75rem 2rem; } }
 """
 
-_PAGE = """<!DOCTYPE html>
+# of every page that is handed out: they load and send nothing
+HEAD = """<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
@@ -76,7 +77,10 @@ _PAGE = """<!DOCTYPE html>
 content="default-src 'none'; style-src 'sha256-{{ style_hash }}'; base-uri 'none'; form-action 'none'">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="referrer" content="no-referrer">
-<title>{{ verdict.assignment }}: {{ verdict.student }}</title>
+"""
+_PAGE = (
+    HEAD
+    + """<title>{{ verdict.assignment }}: {{ verdict.student }}</title>
 <style>{{ style }}</style>
 </head>
 <body>
@@ -124,6 +128,7 @@ content="default-src 'none'; style-src 'sha256-{{ style_hash }}'; base-uri 'none
 </body>
 </html>
 """
+)
 
 _environment = Environment(autoescape=True, trim_blocks=True)
 _environment.filters["points"] = points

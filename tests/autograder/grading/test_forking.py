@@ -14,23 +14,7 @@ from autograder.grading import forking, judge, sandbox
 from autograder.grading.forking import ForkServer, Refused
 from autograder.grading.sandbox import Sandbox, SandboxDied, SandboxUnavailable
 from autograder.paths import COURSE_LIB, ROOT
-
-PRELUDE = """
-import ctypes, errno, json, os, signal, socket, sys, time
-channel = socket.socket(fileno=int(sys.argv[1]))
-
-def say(value):
-    data = json.dumps(value).encode()
-    channel.sendall(len(data).to_bytes(8, "big") + data)
-
-def outcome(function, *arguments):
-    try:
-        return repr(function(*arguments))
-    except OSError as error:
-        return errno.errorcode.get(error.errno, str(error))
-    except BaseException as error:
-        return type(error).__name__
-"""
+from tests.autograder.grading.inside import PRELUDE
 
 
 @pytest.fixture(scope="module")

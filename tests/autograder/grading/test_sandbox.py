@@ -22,35 +22,10 @@ from autograder.grading import bubblewrap, sandbox
 from autograder.grading.forking import ForkServer
 from autograder.grading.sandbox import Limits, MiB, Sandbox, SandboxDied, SandboxGarbage, SandboxTimeout, SandboxUnavailable
 from autograder.paths import COURSE_LIB
+from tests.autograder.grading.inside import PRELUDE
 
 ROOT = Path(__file__).resolve().parents[3]
 PACKAGES = str(Path(pytest.__file__).parents[1])  # where this machine has installed them
-
-PRELUDE = """
-import ctypes, errno, json, os, signal, socket, sys, threading, time
-channel = socket.socket(fileno=int(sys.argv[1]))
-libc = ctypes.CDLL(None, use_errno=True)
-
-def say(value):
-    data = json.dumps(value).encode()
-    channel.sendall(len(data).to_bytes(8, "big") + data)
-
-def hear():
-    length = int.from_bytes(channel.recv(8, socket.MSG_WAITALL), "big")
-    return channel.recv(length, socket.MSG_WAITALL)
-
-def outcome(function, *arguments):
-    try:
-        return repr(function(*arguments))
-    except OSError as error:
-        return errno.errorcode.get(error.errno, str(error))
-    except BaseException as error:
-        return type(error).__name__
-
-def syscall(number, *arguments):
-    result = libc.syscall(number, *arguments)
-    return result if result >= 0 else errno.errorcode[ctypes.get_errno()]
-"""
 
 # so that a mistake in a test's own script can be read
 SAY_ERRORS = """
