@@ -67,6 +67,16 @@ def pytest_report_header():
     return f"COURSE_SEED={os.environ['COURSE_SEED']} (set it to draw the same samples again)"
 
 
+@pytest.fixture(autouse=True)
+def the_process_is_left_as_found():
+    """A folder or a mask that one test leaves changed would fail another, elsewhere in the same worker."""
+    folder, mask = os.getcwd(), os.umask(0o022)
+    os.umask(mask)
+    yield
+    found = os.umask(mask)
+    assert (os.getcwd(), found) == (folder, mask), "this test has changed the working folder or the umask and not put it back"
+
+
 @pytest.fixture(scope="module")  # Playwright's event loop runs as long as it does, and other tests have loops of their own
 def browser():
     from playwright.sync_api import sync_playwright

@@ -104,6 +104,16 @@ def _open_regular(path: Path) -> int:
     return fd
 
 
+def _require_readable(course: Sequence[Path]) -> None:
+    """SandboxUnavailable if one of `course` is for root only (a checkout made under a strict umask): inside runs nobody."""
+    for path in course:
+        if not path.stat().st_mode & stat.S_IROTH:
+            mend = f"chmod -R go+rX {path.resolve().parent}"
+            raise SandboxUnavailable(
+                f"The sandbox does not start: only root can read {path}, and inside runs nobody. Run `{mend}`."
+            )
+
+
 # --- the process ----------------------------------------------------------------------------------------------------
 
 
@@ -182,6 +192,8 @@ class Sandbox:
             self._root = psutil.Process(self._process.pid)
 
     def _sealed(self, channel: int, errors: int) -> subprocess.Popen:
+        if os.geteuid() == 0:
+            _require_readable([self.script, *self.modules])
         passed = [channel]
         try:
             files = self._opened(passed)
@@ -406,13 +418,16 @@ def probe(torch: bool = False, server: ForkServer | None = None) -> list[Problem
     with tempfile.TemporaryDirectory() as folder:
         script = Path(folder, "probe.py")
         script.write_text(PROBE.format(torch=torch))
+        script.chmod(0o644)  # where root grades, what runs inside is nobody, whatever root's umask
         try:
             with Sandbox(script, server=server) as sandbox:
                 answer = sandbox.receive(timeout=START_TIMEOUT).decode()
         except SandboxUnavailable as error:
             return [Problem("no sandbox", str(error))]
         except SandboxError as error:
-            answer = str(error)
+            return [
+                Problem(f"a program that starts inside the sandbox does not answer: {error}", "Try again; then tell the makers.")
+            ]
     if answer != "ok":
         what = f"import torch fails inside the sandbox: {answer[:500]}"
         return [Problem(what, "Install requirements.txt into this environment.")]

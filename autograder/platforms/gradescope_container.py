@@ -42,8 +42,7 @@ def main(arguments: list[str]) -> int:
         except sandbox.SandboxUnavailable as error:
             print(f"Not graded, because the submission could read the solutions: {error}", file=sys.stderr)
             return 3
-    os.umask(0o077)
-    with tempfile.TemporaryDirectory() as folder:  # the grader's layout: the folder has the assignment's name
+    with tempfile.TemporaryDirectory() as folder:  # for its owner only; the grader's layout: the folder has the assignment's name
         handed_in = Path(folder, "submission", assignment)
         shutil.copytree(root / "submission", handed_in, symlinks=True, ignore=_neither_files_nor_folders)
         verdict, _ = grade.judge_folder("submission", assignment, handed_in, TIMEOUT, trusted)

@@ -801,3 +801,22 @@ def test_apparmor_is_named_where_it_is_to_blame(monkeypatch):
 def test_signals_to_the_graders_group_do_not_reach_the_sandbox(enter):
     with enter("hear(); say(os.getpid())") as box:
         assert inside(box) and all(os.getpgid(pid) != os.getpgrp() for pid in inside(box))
+
+
+@pytest.fixture
+def strict_umask():
+    before = os.umask(0o077)
+    yield
+    os.umask(before)
+
+
+def test_the_probe_works_under_any_umask(strict_umask):
+    assert sandbox.probe() == []
+
+
+def test_a_script_that_only_root_can_read_is_named_with_the_mend(strict_umask, monkeypatch, tmp_path):
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    script = tmp_path / "private.py"
+    script.write_text("")
+    with pytest.raises(SandboxUnavailable, match=f"only root can read .*private.py.*chmod -R go.rX {tmp_path}"), Sandbox(script):
+        pass
