@@ -236,6 +236,39 @@ def state_shift(expert_obs, agent_obs):
     return 2 * mean_distance(x, y) - mean_distance(x, x) - mean_distance(y, y)
 
 
+def dagger_round(clone, expert, env, shown, num_episodes, seed):
+    """One round of dataset aggregation: the clone acts, the expert says what it would have
+    done, and both sets of pairs are kept.
+
+    Algorithm 3.1 of Ross et al. (2011), https://arxiv.org/abs/1011.0686, where the clone
+    alone acts (β = 0). It does not train: train_bc does, on what is returned.
+
+    Args:
+      clone: the policy that acts: obs (B, O) float32 tensor -> actions (B, A), or (B,)
+        int64 for discrete ones. Called with B = 1.
+      expert: the policy that is asked, likewise, for any B. Its actions are not executed.
+      env: a Gymnasium environment (not a vector environment).
+      shown: Demonstrations of M steps of E episodes, numbered 0 to E - 1; left as they are.
+      num_episodes: ≥ 1, of the clone. Episode k begins with env.reset(seed=seed + k) and
+        lasts until it is terminated or truncated.
+      seed: of the first new episode.
+
+    Returns: Demonstrations without a graph. First the rows of `shown`, then the new ones, in
+      order of time: obs, what the clone saw; actions, the expert's for them, as it returned
+      them; episode_ids, from E on; returns, those shown, then what the clone earned.
+    Raises: ValueError that names an argument if num_episodes < 1.
+    """
+    flown = collect_demonstrations(clone, env, num_episodes, seed)
+    with torch.no_grad():
+        answers = expert(flown.obs)
+    return Demonstrations(
+        torch.cat([shown.obs, flown.obs]),
+        torch.cat([shown.actions, answers]),
+        torch.cat([shown.episode_ids, flown.episode_ids + len(shown.returns)]),
+        torch.cat([shown.returns, flown.returns]),
+    )
+
+
 def repaired_pairs(obs, actions, episode_ids):
     """The pairs of observation and action that can be saved from the suspect's log.
 

@@ -76,6 +76,7 @@ def _three_commands(generator):
 _ROAD = built("control.road.RoadEnv", time_limit=4, gust=0.05, start=0.7)
 _ONE_ARRAY = built("control.road.RoadEnv", time_limit=4, gust=0.05, start=0.7, one_array=True)
 _OPEN_ROAD = built("control.road.RoadEnv", time_limit=None, gust=0.05, start=0.7)
+_LONG_ROAD = built("control.road.RoadEnv", time_limit=80, gust=0.05, start=0.7)
 _DISCRETE_ROAD = built("control.road.RoadEnv", time_limit=4, gust=0.05, discrete=True)
 _NO_EPISODE = Case("num_episodes = 0", _drive(_ROAD, _driver, num_episodes=0), raises=["num_episodes"], visible=True)
 
@@ -1184,6 +1185,192 @@ STATE_SHIFT = Exercise(
     },
 )
 
+# ------------------------------------------------------------------------------------------------------------ dagger_round
+
+
+@drawing
+def _round(generator, env, clone=_weak, expert=_driver, lengths=(3, 2), num_episodes=2):
+    """A clone on a road, and demonstrations of which every number is another one."""
+    steps = sum(lengths)
+    actions = integers(generator, 0, 3, steps) if expert is _three_commands else normal(generator, steps, 1)
+    columns = {"obs": normal(generator, steps, 5), "actions": actions, "episode_ids": _steps(lengths)}
+    shown = built("control.demonstrations.recorded", **columns, returns=normal(generator, len(lengths)))
+    asked = {"clone": clone(generator), "expert": expert(generator), "env": env, "shown": shown}
+    return asked | {"num_episodes": num_episodes, "seed": _integer(generator, 10_000)}
+
+
+_rounds = versions_of(ch74.dagger_round, satisfies(lambda num_episodes: num_episodes >= 1))
+
+
+def _answered(expert, obs):
+    with torch.no_grad():
+        return expert(obs)
+
+
+def _last_first(shown, flown):
+    return flown, shown
+
+
+def _round_of(
+    fly=lambda clone, expert, *rest: ch74.collect_demonstrations(clone, *rest),
+    asked=lambda expert, flown: _answered(expert, flown.obs),
+    sets=lambda shown, flown: (shown, flown),
+    ids=lambda shown, flown: torch.cat([shown.episode_ids, flown.episode_ids + len(shown.returns)]),
+    change=lambda union: {},
+    checked=True,
+):
+    """A version of the round: who flies, what is asked, which sets are kept. Every setting is the place of a mistake."""
+
+    def version(clone, expert, env, shown, num_episodes, seed):
+        flown = fly(clone, expert, env, num_episodes, seed)
+        flown = replace(flown, actions=asked(expert, flown))
+        kept = sets(shown, flown)
+        numbers = ids(shown, flown) if len(kept) > 1 else kept[0].episode_ids
+        columns = (torch.cat([getattr(one, name) for one in kept]) for name in ("obs", "actions", "returns"))
+        obs, actions, returns = columns
+        union = Demonstrations(obs, actions, numbers, returns)
+        return replace(union, **change(union))
+
+    return _rounds(version, checked)
+
+
+def _step_by_step(clone, expert, env, shown, num_episodes, seed):
+    """The expert is asked at each step; lists are joined at the end."""
+    obs, actions, ids = list(shown.obs), list(shown.actions), shown.episode_ids.tolist()
+    returns = shown.returns.tolist()
+    for k in range(num_episodes):
+        seen, total, over = env.reset(seed=seed + k)[0], 0.0, False
+        while not over:
+            row = torch.tensor(seen)
+            with torch.inference_mode():
+                action, answer = clone(row[None])[0], expert(row[None])[0]
+            obs.append(row)
+            actions.append(answer.clone())
+            ids.append(len(returns))
+            seen, reward, terminated, truncated, _ = env.step(action.numpy())
+            total, over = total + reward, terminated or truncated
+        returns.append(total)
+    return Demonstrations(torch.stack(obs), torch.stack(actions), torch.tensor(ids), torch.tensor(returns))
+
+
+def _filled_in(clone, expert, env, shown, num_episodes, seed):
+    """New columns of the whole length, filled part by part; the number of the next episode from the old ids."""
+    flown = ch74.collect_demonstrations(clone, env, num_episodes, seed)
+    old, steps = len(shown.obs), len(shown.obs) + len(flown.obs)
+    obs, actions = shown.obs.new_empty(steps, 5), shown.actions.new_empty(steps, *shown.actions.shape[1:])
+    obs[:old], obs[old:] = shown.obs, flown.obs
+    actions[:old] = shown.actions
+    for row, seen in enumerate(flown.obs):
+        actions[old + row] = _answered(expert, seen[None])[0]
+    ids = torch.cat([shown.episode_ids, flown.episode_ids + shown.episode_ids.max() + 1])
+    return Demonstrations(obs, actions, ids, torch.cat([shown.returns, flown.returns]))
+
+
+def _with_columns(clone, expert, env, shown, num_episodes, seed):
+    flown = ch74.collect_demonstrations(clone, env, num_episodes, seed)
+    new = vars(replace(flown, actions=expert(flown.obs).detach(), episode_ids=flown.episode_ids + shown.episode_ids[-1] + 1))
+    return Demonstrations(**{name: torch.cat([column, new[name]]) for name, column in vars(shown).items()})
+
+
+def _asked_late(_clone, expert, env, num_episodes, seed, of):
+    """The clone flies; `of` chooses what of each step is kept as its observation."""
+    episodes = _episodes(_clone, env, num_episodes, seed)
+    rows = [(of(step), step[1], number) for number, steps in enumerate(episodes) for step in steps]
+    obs, actions, ids = zip(*rows, strict=True)
+    return Demonstrations(torch.stack(obs), torch.stack(actions), torch.tensor(ids), _paid(episodes, _sums))
+
+
+_WRONG_DAGGER_ROUND = {
+    "clones-own-labels": (
+        {"asked": lambda _expert, flown: flown.actions},
+        "These are the clone's own actions in its own states: trained on them, it learns what it does already. Ask the expert.",
+    ),
+    "expert-flies": (
+        {"fly": lambda _clone, expert, *rest: ch74.collect_demonstrations(expert, *rest)},
+        "The expert has flown: these are its states, more demonstrations, and not one state to which the clone's mistakes lead.",
+    ),
+    "new-rows-only": (
+        {"sets": lambda _shown, flown: (flown,)},
+        "The demonstrations are gone: the union is trained on, or the clone forgets how the expert begins.",
+    ),
+    "old-rows-only": ({"sets": lambda shown, _flown: (shown,)}, "Nothing was added: the new rows belong to the result."),
+    "new-rows-first": (
+        {"sets": _last_first, "ids": lambda shown, flown: torch.cat([flown.episode_ids + len(shown.returns), shown.episode_ids])},
+        "The new rows stand before the old: `shown` comes first.",
+    ),
+    "ids-from-zero-again": (
+        {"ids": lambda shown, flown: torch.cat([shown.episode_ids, flown.episode_ids])},
+        "The new episodes are numbered from 0 again, and each shares its number with an old one: a split by episodes takes them for one.",
+    ),
+    "ids-overlap-by-one": (
+        {"ids": lambda shown, flown: torch.cat([shown.episode_ids, flown.episode_ids + len(shown.returns) - 1])},
+        "The first new episode has the number of the last old one: E episodes are numbered 0 to E - 1, so the next is E.",
+    ),
+    "ids-count-steps": (
+        {"ids": lambda shown, flown: torch.cat([shown.episode_ids, flown.episode_ids + len(shown.obs)])},
+        "The new numbers begin at the number of *steps*: E is the number of episodes, len(shown.returns).",
+    ),
+    "asked-after-the-step": (
+        {"fly": lambda *given: _asked_late(*given, of=lambda step: step[-1])},
+        "The expert was asked about the state that came *after* each of the clone's actions: ask about the one it acted in.",
+    ),
+    "answers-in-disagreement-only": (
+        {
+            "asked": lambda expert, flown: torch.where(
+                _answered(expert, flown.obs) > 0, flown.actions, _answered(expert, flown.obs)
+            )
+        },
+        "Some labels are the clone's: every new row gets the expert's answer.",
+    ),
+    "seed-off-by-the-old": (
+        {"fly": lambda clone, expert, env, count, seed: ch74.collect_demonstrations(clone, env, count, seed + 2)},
+        "The new episode k is reset with seed + k, whatever number it gets among the demonstrations.",
+    ),
+    "one-episode-only": (
+        {"fly": lambda clone, expert, env, count, seed: ch74.collect_demonstrations(clone, env, 1, seed)},
+        "One episode was flown: num_episodes says how many.",
+    ),
+    "answers-halfway": (
+        {"asked": lambda expert, flown: (_answered(expert, flown.obs) + flown.actions) / 2},
+        "The labels lie halfway between the clone's action and the expert's: only the expert's are labels.",
+    ),
+    "graph-kept": (
+        {"asked": lambda expert, flown: expert(flown.obs) + 0 * flown.obs.requires_grad_().sum()},
+        "The answers carry the expert's graph: ask it under torch.no_grad().",
+    ),
+    "dtype-lost": (
+        {"change": lambda union: {"obs": union.obs.double(), "returns": union.returns.double()}},
+        "Observations and returns are to be float32, as networks take them; NumPy's own numbers are float64.",
+    ),
+}
+
+DAGGER_ROUND = Exercise(
+    name="dagger_round",
+    reference=ch74.dagger_round,
+    criteria={"values": 1.2, "gradient": 0.1, "dtype": 0.1, "errors": 0.1},
+    cases=(
+        Case("a clone that drifts off the road", _round(_LONG_ROAD), visible=True),
+        Case("episodes that are cut off", _round(_ROAD, _strong), visible=True),
+        Case("discrete commands", _round(_DISCRETE_ROAD, _three_commands, _three_commands)),
+        Case("a single new episode", _round(_ROAD, num_episodes=1, lengths=(2, 1, 3)), visible=True),
+        Case("an expert with a graph", _round(_ROAD, expert=_strong)),
+        Case("a road that fills one array anew", _round(_ONE_ARRAY)),
+        Case("num_episodes = 0", _round(_ROAD, num_episodes=0), raises=["num_episodes"], visible=True),
+    ),
+    misconceptions=(
+        *wrong(_WRONG_DAGGER_ROUND, lambda mistake: _round_of(**mistake)),
+        bad_input_accepted(
+            _rounds(lambda *given: ch74.dagger_round(*given) if given[4] else given[3], checked=False), _EPISODES_NEEDED
+        ),
+    ),
+    variants={
+        "step by step": _rounds(_step_by_step),
+        "columns filled in": _rounds(_filled_in),
+        "column by column": _rounds(_with_columns),
+        "the round with its parts": _round_of(),
+    },
+)
+
 # ---------------------------------------------------------------------------------------------------------- repaired_pairs
 
 
@@ -1317,5 +1504,6 @@ EXERCISES = (
     TRAIN_BC,
     EVALUATE,
     STATE_SHIFT,
+    DAGGER_ROUND,
     REPAIRED_PAIRS,
 )

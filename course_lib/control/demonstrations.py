@@ -17,6 +17,12 @@ class Demonstrations:
     returns: torch.Tensor  # (E,) float32, undiscounted, in units of reward
 
 
+def recorded(obs, actions, episode_ids, returns):
+    """Demonstrations of numbers of any precision: obs, returns and actions that are no indices become float32."""
+    actions = actions.float() if actions.is_floating_point() else actions
+    return Demonstrations(obs.float(), actions, episode_ids, returns.float())
+
+
 class SquaredError:
     """A loss: the mean of (gain · output - action)², for `loss_fn(outputs, actions)`."""
 

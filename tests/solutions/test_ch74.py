@@ -10,6 +10,7 @@ from course_lib.control.road import LinearPolicy, RoadDriver, RoadEnv
 from solutions.ch74 import (
     behavioural_cloning_loss,
     collect_demonstrations,
+    dagger_round,
     evaluate,
     gaussian_cloning_loss,
     repaired_pairs,
@@ -210,3 +211,22 @@ def test_repaired_pairs_by_hand():
 def test_errors_name_the_argument_and_the_value_received(call, names):
     with pytest.raises(ValueError, match=names):
         call()
+
+
+def test_a_round_keeps_what_was_shown_and_asks_about_every_state_of_the_clone():
+    env, driver = RoadEnv(time_limit=9, gust=0.05), RoadDriver()
+    shown = collect_demonstrations(driver, env, 2, seed=3)
+    union = dagger_round(HARD_LEFT, driver, env, shown, 3, seed=70)
+    flown, old = collect_demonstrations(HARD_LEFT, env, 3, seed=70), len(shown.obs)
+    assert torch.equal(union.obs[:old], shown.obs) and torch.equal(union.actions[:old], shown.actions)
+    assert torch.equal(union.obs[old:], flown.obs) and torch.equal(union.actions[old:], driver(flown.obs))
+    assert union.episode_ids.unique().tolist() == [0, 1, 2, 3, 4] and len(union.returns) == 5
+    assert torch.equal(union.returns[2:], evaluate(HARD_LEFT, env, 3, seed=70))
+
+
+def test_where_the_driver_flies_itself_a_round_is_more_demonstrations():
+    env, driver = RoadEnv(time_limit=6), RoadDriver()
+    shown = collect_demonstrations(driver, env, 1, seed=0)
+    union, longer = dagger_round(driver, driver, env, shown, 2, seed=1), collect_demonstrations(driver, env, 3, seed=0)
+    for name in ("obs", "actions", "episode_ids", "returns"):
+        assert torch.equal(getattr(union, name), getattr(longer, name))
