@@ -1272,10 +1272,10 @@ def _with_columns(clone, expert, env, shown, num_episodes, seed):
     return Demonstrations(**{name: torch.cat([column, new[name]]) for name, column in vars(shown).items()})
 
 
-def _asked_late(_clone, expert, env, num_episodes, seed, of):
-    """The clone flies; `of` chooses what of each step is kept as its observation."""
-    episodes = _episodes(_clone, env, num_episodes, seed)
-    rows = [(of(step), step[1], number) for number, steps in enumerate(episodes) for step in steps]
+def _flown_and_seen_late(clone, _expert, *rest):
+    """The clone flies, and what it saw *after* each step is written down."""
+    episodes = _episodes(clone, *rest)
+    rows = [(after, action, number) for number, steps in enumerate(episodes) for _, action, _, after in steps]
     obs, actions, ids = zip(*rows, strict=True)
     return Demonstrations(torch.stack(obs), torch.stack(actions), torch.tensor(ids), _paid(episodes, _sums))
 
@@ -1311,7 +1311,7 @@ _WRONG_DAGGER_ROUND = {
         "The new numbers begin at the number of *steps*: E is the number of episodes, len(shown.returns).",
     ),
     "asked-after-the-step": (
-        {"fly": lambda *given: _asked_late(*given, of=lambda step: step[-1])},
+        {"fly": _flown_and_seen_late},
         "The expert was asked about the state that came *after* each of the clone's actions: ask about the one it acted in.",
     ),
     "answers-in-disagreement-only": (
