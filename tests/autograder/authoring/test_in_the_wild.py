@@ -11,10 +11,11 @@ import yaml
 
 from autograder.authoring import chapter, markdown
 from autograder.paths import ROOT
-from experiments.atlas import comparing, keeping
+from experiments.atlas import comparing, given, keeping
 
 TITLE = "In the wild, "
 RECORDS = keeping.load_all()
+FORMULAS = given.formulas()
 NOT_RUN = yaml.safe_load((keeping.FOLDER / "not_run.yml").read_text(encoding="utf-8"))
 LINK = re.compile(r"\[(?P<text>[^\]]*)\]\(atlas:(?P<row>[^)]*)\)")
 SCRIPT = re.compile(r"`(?P<path>findings/[\w-]+\.sh)`")
@@ -56,6 +57,12 @@ def linked(link):
     return [(record, row) for row in rows]
 
 
+def numbers_of_its_words(row):
+    """The numbers in a row's setting, note and rule."""
+    rules = {rule.name: rule.sentence for rule in FORMULAS[row["formula"]].rules}
+    return [float(one) for one in re.findall(r"\d+(?:\.\d+)?", f"{row['setting']} {row['note']} {rules.get(row['rule'], '')}")]
+
+
 def traced(sentence, month):
     """Check that a sentence of the box of a month says what rows, works or scripts say."""
     rows = [found for link in LINK.finditer(sentence) for found in linked(link)]
@@ -63,7 +70,7 @@ def traced(sentence, month):
     assert LINK.search(sentence) or scripts or "{cite" in sentence, f"rests on nothing: {sentence}"
     for record, _ in rows:
         assert f"{date.fromisoformat(record['date']):%B %Y}" == month, f"of another month: {sentence}"
-    known = [number for _, row in rows for number in comparing.flat([row["numbers"], row["ours"]])]
+    known = [number for _, row in rows for number in [*comparing.flat([row["numbers"], row["ours"]]), *numbers_of_its_words(row)]]
     prose = re.sub(r"\{[^}]*\}`[^`]*`|`[^`]*`|\$[a-z]_\d\$", " ", LINK.sub(" ", sentence))
     for found in NUMBER.findall(prose):
         digits = len(found.partition(".")[2])
