@@ -47,7 +47,7 @@ _INLINE = re.compile(
     r"\{(?P<role>[A-Za-z][\w:+-]*)\}`(?P<content>[^`]+)`"
     r"|(?P<ticks>`+)(?!`).+?(?<!`)(?P=ticks)(?!`)"
     r"|(?<![\\$])\$(?!\$)(?:\\.|[^$\\\n]|\n(?!\s*\n))+?\$"
-    r"|\[(?P<text>[^\]]*)\]\((?:chapter:(?P<chapter>\d+)|appendix:(?P<appendix>[a-z-]+))\)",
+    r"|\[(?P<text>[^\]]*)\]\((?:chapter:(?P<chapter>\d+)|appendix:(?P<appendix>[a-z-]+)|atlas:(?P<atlas>[\w./-]+))\)",
     re.DOTALL,
 )
 _REFUSED = [
@@ -57,6 +57,7 @@ _REFUSED = [
     (re.compile(r"\[\^"), "footnotes are not used: notebooks cannot show them; write a :::{margin} note"),
     (re.compile(r"\(chapter:"), "a link to a chapter is written [text](chapter:43)"),
     (re.compile(r"\(appendix:"), "a link to an appendix is written [text](appendix:notation)"),
+    (re.compile(r"\(atlas:"), "a link to a row of the atlas is written [library version](atlas:formula/library/rule)"),
     (re.compile(r"(BEGIN|END) (SOLUTION|HIDDEN TESTS|MARK SCHEME)"), "nbgrader would take this text for a marker of its own"),
 ]
 
@@ -153,6 +154,10 @@ class Dialect(ABC):
         """A link to an appendix of the book; its text alone where there is none, as in a notebook."""
         return text
 
+    def atlas(self, row: str, text: str) -> str:
+        """A link to a row of the atlas, formula/library/rule; its text alone where there is no atlas, as in a notebook."""
+        return text
+
     @abstractmethod
     def bibliography(self) -> str:
         """The works in `cited`."""
@@ -206,6 +211,9 @@ class Book(Dialect):
     def appendix(self, name: str, text: str) -> str:
         return f"[{text}](../{name}.md)"
 
+    def atlas(self, row: str, text: str) -> str:
+        return f"[{text}](#{atlas_label(row.partition('/')[0])})"
+
     def bibliography(self) -> str:
         return f"```{{bibliography}}\n:filter: docname in docnames\n:keyprefix: {self.assignment}-\n```"
 
@@ -255,6 +263,11 @@ def render(text: str, dialect: Dialect, line: int = 1) -> str:
     return "\n".join(_rendered(block, dialect) for block in parse(text, line))
 
 
+def atlas_label(formula: str) -> str:
+    """The place of a formula's table in the appendix."""
+    return f"atlas-{formula.replace('_', '-')}"
+
+
 def labels(text: str, line: int = 1) -> Iterator[tuple[str, int]]:
     """The labels of the numbered equations in a text, in order, with their lines."""
     for block in parse(text, line):
@@ -274,7 +287,7 @@ def _rendered(block: Block, dialect: Dialect) -> str:
     if block.kind == "quiz":
         return _quiz(block, dialect)
     if block.kind == "dropdown" and any(
-        match["role"] or match["chapter"] or match["appendix"] for match in _INLINE.finditer(block.argument)
+        match["role"] or match["chapter"] or match["appendix"] or match["atlas"] for match in _INLINE.finditer(block.argument)
     ):
         raise MarkdownError(block.line, "a fold's title holds no link, as it is a button itself: put the link into the fold")
     body = render(block.text, dialect, block.body_line)
@@ -315,7 +328,7 @@ def _choice(line: int, right: bool, text: str, dialect: Dialect) -> Choice:
 
 
 def _inline(text: str, dialect: Dialect, line: int) -> str:
-    """Replace roles and links to chapters and appendices; leave code spans and inline maths alone."""
+    """Replace roles and links to chapters, appendices and the atlas; leave code spans and inline maths alone."""
     _refuse(_INLINE.sub(lambda match: re.sub(r"[^\n]", "x", match[0]), text), line)
 
     def replace(match: re.Match[str]) -> str:
@@ -323,6 +336,8 @@ def _inline(text: str, dialect: Dialect, line: int) -> str:
             return dialect.role(match["role"], match["content"].strip(), line + text.count("\n", 0, match.start()))
         if match["appendix"]:
             return dialect.appendix(match["appendix"], match["text"])
+        if match["atlas"]:
+            return dialect.atlas(match["atlas"], match["text"])
         return dialect.chapter(int(match["chapter"]), match["text"]) if match["chapter"] else match[0]
 
     return _INLINE.sub(replace, text)

@@ -12,6 +12,7 @@ from typing import Any
 
 import yaml
 
+from autograder.authoring.markdown import atlas_label
 from autograder.paths import ROOT
 from experiments.atlas import comparing, keeping
 from experiments.atlas.given import TOLERANCE, Formula, formulas
@@ -54,7 +55,7 @@ def page(records: Records, described: Mapping[str, Formula]) -> str:
         if chapter is None:
             parts.append('What stands here as "the book\'s" is the usual formula, written out for the comparison.')
         parts += [_section(records, one) for one in described.values() if one.chapter == chapter and _rows(records, one.name)]
-    parts += ["## The libraries", _libraries(records), "## Read, not run", _not_run()]
+    parts += ["## The libraries", _libraries(records), f"({atlas_label('not_run')})=\n## Read, not run", _not_run()]
     parts.append('```{raw} html\n<script defer src="_static/atlas.js"></script>\n```')
     return "\n\n".join(parts) + "\n"
 
@@ -99,7 +100,7 @@ def _in_brackets(setting: str) -> str:
 
 def _section(records: Records, formula: Formula) -> str:
     lines = [
-        f"(atlas-{formula.name.replace('_', '-')})=",
+        f"({atlas_label(formula.name)})=",
         f"### {formula.title}",
         "",
         f"{'The book' if formula.chapter else 'The usual form'}: {_shown(formula.ours)}",

@@ -13,12 +13,13 @@ import nbformat
 import yaml
 from nbformat.v4 import new_markdown_cell, new_notebook
 
-from autograder.authoring import assemble, chapter
+from autograder.authoring import assemble, chapter, markdown
 from autograder.authoring.chapter import Chapter
 from autograder.paths import ROOT
 from autograder.proving.locks import one_at_a_time
 from autograder.publishing import book
 from autograder.publishing.execution import cache_folder, executed_outputs
+from experiments.atlas import keeping
 
 
 def build(name: int | str, with_solutions: bool = True) -> Path:
@@ -45,6 +46,7 @@ def staged_files(own: Chapter, with_solutions: bool) -> dict[str, bytes]:
     chapters = chapter.all_chapters()
     files = {"index.md": b"# Policy Optimisation\n\nOne page of the book: {doc}`" + book.docname(own).encode() + b"`.\n"}
     files |= {f"{name}.md": _stub(name.rpartition("/")[2]) for name in (*book.HOW_TO, *book.APPENDICES) if name != "kill-matrix"}
+    files["atlas.md"] = _atlas_stub()
     for other in chapters:
         if other.number != own.number:
             text = f"# {other.number}. {other.title}\n\nThis chapter is not built here."
@@ -58,6 +60,13 @@ def staged_files(own: Chapter, with_solutions: bool) -> dict[str, bytes]:
 
 def _stub(title: str) -> bytes:
     return f"# {title.replace('-', ' ').capitalize()}\n\nThis page is not built here.\n".encode()
+
+
+def _atlas_stub() -> bytes:
+    """With the places to which chapters link."""
+    formulas = {row["formula"] for record in keeping.load_all().values() for row in record["rows"]}
+    targets = "\n\n".join(f"({markdown.atlas_label(one)})=\n{one}" for one in sorted(formulas | {"not_run"}))
+    return _stub("atlas") + f"\n{targets}\n".encode()
 
 
 def _notebook(text: str) -> bytes:

@@ -126,6 +126,16 @@ def test_links_to_appendices_lead_to_pages_and_stay_words_in_notebooks():
     assert _render(text) == "see the signs"
 
 
+def test_links_to_the_atlas_lead_to_a_formulas_table_and_stay_words_in_notebooks():
+    text = "[skrl 2.1.1](atlas:clip_fraction/skrl/equal)"
+    assert _render(text, markdown.Book) == "[skrl 2.1.1](#atlas-clip-fraction)"
+    assert _render(text) == "skrl 2.1.1"
+    with pytest.raises(markdown.MarkdownError, match="a link to a row of the atlas is written"):
+        _render("(atlas:clip_fraction)")
+    with pytest.raises(markdown.MarkdownError, match="a fold's title holds no link"):
+        _render(f":::{{dropdown}} {text}\nx\n:::")
+
+
 def test_citations_are_words_in_notebooks_and_prefixed_keys_in_the_book():
     text = "{cite:t}`sutton2018` ({cite:p}`schulman2016, sutton2018`)"
     assert _render(text) == "Sutton and Bärto (2018) ((Schulman et al., 2016; Sutton and Bärto, 2018))"
