@@ -415,7 +415,7 @@ class _Run:
         if "observations" in told:
             self._uses[exercise.name] = frozenset(map(str, _list(told.get("uses", []))))
             return self._compared(exercise, _observations(told["observations"], exercise))
-        if told.get("missing"):
+        if told.get("missing") is True:  # a tensor has no truth of its own
             return self._missing(exercise)
         if told.get("ended") == "timeout":
             return self._timed_out(exercise)

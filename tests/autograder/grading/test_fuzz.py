@@ -34,8 +34,17 @@ WORDS = st.sampled_from(
         "id",
         "f",
         "test_f",
+        "nbformat",
+        "worksheets",
+        "input",
+        "outputs",
+        "language_info",
+        "version",
+        "def f(): return 1",
+        "\ud800",
+        "\0",
+        "(" * 300,
     ]
-    + ["nbformat", "worksheets", "input", "outputs", "language_info", "version", "def f(): return 1", "\ud800", "\0", "(" * 300]
 )
 ODD = st.none() | st.booleans() | st.sampled_from([0, -1, 3, 4, 5, 10**400, float("nan"), float("inf")]) | WORDS
 JSON = st.recursive(ODD, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(WORDS, inner, max_size=4), max_leaves=8)
