@@ -239,6 +239,11 @@ def grade(
 ) -> None:
     """Grade all submissions in a folder. Exit status: 0 all have a verdict, 1 below --fail-under, 2 bad input, 3 the grader
     failed, 4 something in the folder was not understood; what was seen stands on standard error."""
+    from autograder.grading import forking
+
+    if submitted.is_dir() and not (trust_submissions or scheduler):
+        forking.course.begin()  # before anything here loads torch: the two take seconds, on a processor each
+
     from sqlalchemy.exc import SQLAlchemyError
 
     from autograder import grade

@@ -109,7 +109,7 @@ def _write_all(
     )
 
     graded = {assignment for _, assignment, _ in tasks} & judge.assignments()
-    releases = {name: assemble.for_learners(chapter.load(name)) for name in sorted(graded)}
+    releases = {name: judge.released(name).notebook for name in sorted(graded)}
     gradebook.write_course(out, releases, db_url)
     folders = {(student, assignment): folder for student, assignment, folder in tasks}
     results = []

@@ -22,7 +22,7 @@ from typing import Any
 
 import psutil
 
-import course_lib
+from autograder import paths
 from autograder.grading import bubblewrap, seccomp
 
 INSIDE = Path(__file__).with_name("forkserver.py")
@@ -30,7 +30,9 @@ PYTHON_OPTIONS = ("-P", "-s", "-S", "-B")  # the standard library's path only, n
 FOLDERS = ("/course", "/site", "/work")  # sys.path after the standard library
 PRELOADED = (
     "torch",
+    "torch.fx.experimental.symbolic_shapes",  # and sympy, half a second, with a process's first gradient
     "matplotlib.pyplot",
+    "course_lib.chapters",
     "course_lib.checks.magics",
     "course_lib.checks.names",
     "course_lib.checks.notebook",
@@ -175,7 +177,7 @@ class Shared:
             self._former, self._server, self.given_up = self._server or self._former, None, why
 
 
-course = Shared(lambda: ForkServer([Path(course_lib.__file__).parent]))
+course = Shared(lambda: ForkServer([paths.COURSE_LIB]))
 
 
 class Leash:

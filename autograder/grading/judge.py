@@ -19,16 +19,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from nbformat import NotebookNode
 
-import course_lib
 from autograder import checks
-from autograder.authoring import artefacts, assemble, chapter, freeze
+from autograder.authoring import artefacts, assemble, chapter, contract, freeze
 from autograder.authoring.spec import Artefact
 from autograder.grading import flights, forking, intake, repair
 from autograder.grading.attempts import Attempt, Past, plan, share, suspect
 from autograder.grading.sandbox import Sandbox, SandboxDied, SandboxError, SandboxGarbage, SandboxTimeout, SandboxUnavailable
 from autograder.grading.verdicts import Item, Verdict, clean_text
-from autograder.paths import ROOT
+from autograder.paths import COURSE_LIB, ROOT
 from course_lib.checks.artefact import FrozenArtefact
 from course_lib.checks.cases import FrozenExercise, Observation
 from course_lib.checks.diagnosis import Finding, diagnose, view
@@ -38,7 +38,6 @@ from course_lib.checks.notebook import needed as needed_stops
 from course_lib.checks.stored import decode, encode
 
 WORKER = Path(__file__).with_name("worker.py")
-COURSE_LIB = Path(course_lib.__file__).parent
 START_SECONDS = 120.0  # importing torch on a busy machine; nothing of the learner's has run by then
 GRACE_SECONDS = 5.0  # how much longer the judge waits than the worker's own timer
 MAX_TEXT = 4 << 20  # bytes of a worker's answer that are not numbers; honest ones have a hundredth of it
@@ -66,6 +65,8 @@ class Released:
     live_ids: frozenset[str]
     environment: str
     form: repair.Form = field(default_factory=repair.Form)
+    notebook: NotebookNode = field(default_factory=NotebookNode)
+    """As it was handed out."""
 
 
 _PREPARING = threading.Lock()
@@ -86,7 +87,8 @@ def released(assignment: str) -> Released:
 @functools.cache
 def _released(assignment: str) -> Released:
     page = chapter.load(assignment)
-    outline = assemble.outline(page)
+    sources = contract.sources(page, alone=True)
+    outline = assemble.outline(page, sources)
     exercises = tuple(
         artefacts.hidden(exercise) if isinstance(exercise, Artefact) else freeze.complete(exercise)
         for exercise in checks.exercises(assignment)
@@ -94,7 +96,7 @@ def _released(assignment: str) -> Released:
     names = {exercise.name for exercise in exercises}
     tests = {f"test_{name}" for name in names}
     questions = {name for name, _ in outline.open_questions}
-    notebook = assemble.for_learners(page)
+    notebook = assemble.for_learners(page, sources=sources)
     live = [cell for cell in notebook.cells if cell.cell_type == "code" and is_live(cell)]
     return Released(
         assignment,
@@ -105,6 +107,7 @@ def _released(assignment: str) -> Released:
         frozenset(cell.id for cell in live),
         environment(),
         repair.form(notebook),
+        notebook,
     )
 
 
@@ -412,7 +415,7 @@ class _Run:
         if "observations" in told:
             self._uses[exercise.name] = frozenset(map(str, _list(told.get("uses", []))))
             return self._compared(exercise, _observations(told["observations"], exercise))
-        if told.get("missing"):
+        if told.get("missing") is True:  # a tensor has no truth of its own
             return self._missing(exercise)
         if told.get("ended") == "timeout":
             return self._timed_out(exercise)

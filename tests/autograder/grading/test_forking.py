@@ -413,3 +413,9 @@ def test_a_forked_process_imports_torch_in_no_time(enter):
         told(box)
         used = [process.cpu_times() for process in (box._root, *box._tree())]
     assert sum(one.user + one.system for one in used) < 0.5
+
+
+def test_a_server_can_be_started_before_this_process_has_loaded_torch():
+    code = "import sys\nfrom autograder.grading import bubblewrap, forking\nbubblewrap.packages()\nprint('torch' in sys.modules)"
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert told.stdout == "False\n"

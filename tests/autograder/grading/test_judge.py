@@ -313,3 +313,10 @@ def test_a_notebook_of_another_chapter_is_named_and_nothing_of_it_runs(monkeypat
     verdict = judge.judge(handed_in, OURS)
     assert (verdict.status, verdict.score, verdict.flags) == ("needs_review", 0, ("other_chapter: ch43",))
     assert "This is chapter 43's notebook (ch43), handed in as ch44" in verdict.items[0].message
+
+
+@pytest.mark.parametrize("key", ["missing", "ended"])
+def test_numbers_where_a_word_belongs_cost_their_own_exercise_only(key):
+    attempt = run("def f(): ...")
+    finding = attempt._ask(Scripted(encode({key: torch.ones(2)})), EXERCISE, 0.3)
+    assert (finding.state, finding.message) == ("error", "The call ended its process.")
