@@ -1080,8 +1080,7 @@ _WRONG_RULES = {
     ),
     "final-value-added": (
         _gae_as(current_value=lambda x: _termination(x.but(rewards=x.rewards + x.gamma * x.next_values * x.truncated))),
-        "“current_value”: the value added is next_values, of the observation after the step; this rule adds values, of the one before."
-        + wild.also("final_value_even_at_an_end", "gae"),
+        "“current_value”: the value added is next_values, of the observation after the step; this rule adds values, of the one before.",
     ),
     "current-value-not-at-an-end": (
         _gae_as(
@@ -1364,6 +1363,7 @@ WHICH_GAE = Exercise(
         Case("three rules, in another order", _logged("leak", rules=_SOME), closed_form=_only("leak", of=_SOME), visible=True),
         Case("one entry is 0.01 too large", _logged("leak", _wild_ends, off=0.01), closed_form=_only(), visible=True),
         Case("one entry is 0.002 too small", _logged("textbook", _wild_ends, off=-0.002), closed_form=_only(), visible=True),
+        Case("all entries are 0.01 off", _logged("termination", _wild_ends, noise=0.01), closed_form=_only(), visible=True),
         Case("one entry is far too small", _logged("textbook", _wild_rollout(), off=-9.0), closed_form=_only(), visible=True),
         Case("the last entry is too large", _logged("textbook", off=0.5, at=(7, 2)), closed_form=_only()),
         Case("inputs that require gradient", _logged("leak"), differentiate=("logged", *_WILD), visible=True, draws=1),
