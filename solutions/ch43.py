@@ -117,6 +117,71 @@ def clip_fraction(log_probs, old_log_probs, clip_range=0.2):
     return outside.to(log_probs.dtype).mean()
 
 
+def clip_fraction_as(rule, log_probs, old_log_probs, advantages, clip_range=0.2):
+    """The clip fraction by either of the two rules that libraries log under this name.
+
+        mean(counted),   ρ = exp(log_probs - old_log_probs)
+
+    Rule "outside" counts the samples whose ratio has left [1 - ε, 1 + ε], on either side.
+    Rule "silenced" gives the silent fraction: it counts only those whose gradient the clip
+    takes away. A sample whose advantage is 0 has none to lose.
+
+    Args:
+      rule: "outside" or "silenced".
+      log_probs: log π(a|s) of the current policy, in nats; (B,).
+      old_log_probs: the same under the policy that acted; (B,).
+      advantages: (B,), in units of reward unless normalised.
+      clip_range: ε ≥ 0, dimensionless; infinity means no clipping.
+
+    Returns: scalar (0-dim) tensor in [0, 1], in the dtype of log_probs, without a graph.
+    Raises: ValueError that names an argument if rule is another, the shapes differ or
+      clip_range < 0.
+    """
+    if rule not in ("outside", "silenced"):
+        raise ValueError(f"rule must be 'outside' or 'silenced', got {rule!r}")
+    validate.same_shape(
+        log_probs=log_probs, old_log_probs=old_log_probs, advantages=advantages
+    )
+    if rule == "outside":
+        return clip_fraction(log_probs, old_log_probs, clip_range)
+    validate.non_negative(clip_range=clip_range)
+    ratio = importance_ratio(log_probs, old_log_probs)
+    passed = (advantages > 0) & (ratio > 1 + clip_range)
+    passed |= (advantages < 0) & (ratio < 1 - clip_range)
+    return passed.to(log_probs.dtype).mean()
+
+
+def which_diagnostics(
+    logged_kl, logged_fraction, log_probs, old_log_probs, advantages, clip_range=0.2
+):
+    """Which rules made the two numbers that a library has logged for a batch.
+
+        |logged - computed| ≤ 1e-5 max(1, |logged|)
+
+    Logs are in single precision, hence the tolerance. Where two rules agree, both fit; where
+    the library follows another one, none does.
+
+    Args:
+      logged_kl: the "approximate KL" in nats; scalar (0-dim).
+      logged_fraction: the "clip fraction"; scalar (0-dim).
+      log_probs: log π(a|s) of the current policy, in nats; (B,).
+      old_log_probs: the same under the policy that acted; (B,).
+      advantages: (B,), in units of reward unless normalised.
+      clip_range: ε ≥ 0, dimensionless; infinity means no clipping.
+
+    Returns: (4,) bool tensor: whether logged_kl fits k1, the mean of -log ρ, and k3; and
+      whether logged_fraction fits "outside" and "silenced" of clip_fraction_as.
+    Raises: ValueError that names an argument if the shapes of the batch differ or
+      clip_range < 0.
+    """
+    batch = (log_probs, old_log_probs, advantages, clip_range)
+    fractions = [clip_fraction_as(rule, *batch) for rule in ("outside", "silenced")]
+    kls = [(old_log_probs - log_probs).mean(), approx_kl(log_probs, old_log_probs)]
+    computed = torch.stack([*kls, *fractions]).detach()
+    logged = torch.stack([logged_kl, logged_kl, logged_fraction, logged_fraction])
+    return (logged - computed).abs() <= 1e-5 * logged.abs().clamp(min=1)
+
+
 def repaired_losses(log_probs, advantages, clip_range=0.2):
     """The clipped losses that the suspect program of the bug lab should have minimised, epoch
     by epoch.

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import torch
 
+from autograder.authoring import wild
 from autograder.authoring.parts import (
     IN_PLACE,
     METRIC,
@@ -383,8 +384,12 @@ def _clip_in_python(ratios, advantages, e):
 
 def clip_by_mask(r, a, e):
     """Where the clip holds, the ratio is a constant."""
-    saturated = ((a > 0) & (r > 1 + e)) | ((a < 0) & (r < 1 - e))
-    return (torch.where(saturated, r.detach().clamp(1 - e, 1 + e), r) * -a).mean()
+    return (torch.where(clip_silences(r, a, e), r.detach().clamp(1 - e, 1 + e), r) * -a).mean()
+
+
+def clip_silences(r, a, e):
+    """Where the clip takes the gradient away: improved, and past the bound."""
+    return ((a > 0) & (r > 1 + e)) | ((a < 0) & (r < 1 - e))
 
 
 def clip_by_excess(r, a, e):
@@ -524,7 +529,8 @@ def _kl_numpy(d):
 _WRONG_ESTIMATORS = {
     "log-ratio-estimator": (
         lambda r, d: -d,
-        "mean(-log ρ) is the estimator k1: unbiased too, but noisy, and negative for many batches. Add ρ - 1.",
+        "mean(-log ρ) is the estimator k1: unbiased too, but noisy, and negative for many batches. Add ρ - 1."
+        + wild.also("k1", "approx_kl", "token_approx_kl"),
     ),
     "squared-log-ratio-estimator": (
         lambda r, d: d.square() / 2,
@@ -692,6 +698,382 @@ CLIP_FRACTION = Exercise(
     },
 )
 
+# ------------------------------------------------------------------------------------------------------ clip_fraction_as
+
+_SILENCED_BY = wild.also("silenced", "token_clip_fraction", what="“silenced” is")
+_KNOWN_FRACTIONS = ("outside", "silenced")
+
+
+def _counted(outside=_is_outside, silenced=clip_silences, ratio=_ratio, known=_KNOWN_FRACTIONS, **options):
+    """A version of both rules: `outside` takes the ratio and the clip range, `silenced` also the advantages, in between; what they give is
+    averaged. `known` are the names that it takes; others are refused."""
+
+    def fraction(rule, new, old, advantages, e):
+        if rule not in known:
+            raise ValueError(f"no such rule: {rule}")
+        r = ratio(new, old)
+        return (outside(r, e) if rule == "outside" else silenced(r, advantages, e)).to(new.dtype).mean()
+
+    checks = (one_shape(*TRIPLE), _NOT_NEGATIVE)
+    return versions_of(ch43.clip_fraction_as, *checks, data=TRIPLE)(fraction, **options)
+
+
+class _Anything:
+    """Contains whatever one asks for."""
+
+    def __contains__(self, _name):
+        return True
+
+
+def _by(rule, inputs):
+    return lambda generator: {"rule": rule, **inputs(generator)}
+
+
+def _zero_for_outside(rule, log_probs, old_log_probs, advantages, clip_range=0.2):
+    return torch.tensor(0.5 if rule == "silenced" else 1.0, dtype=torch.float64)
+
+
+def _no_gain(generator):
+    """Outside on either side, and no advantage at all: nothing has a gradient to lose."""
+    drawn = _quadrants(1.0)(generator)
+    return drawn | {"advantages": torch.zeros_like(drawn["advantages"])}
+
+
+def _four_cases(generator):
+    drawn = _quadrants(1.0)(generator)
+    return {name: value[:4] for name, value in drawn.items()}
+
+
+def _minibatch_of_the_atlas(_generator):
+    """The minibatch that the libraries were given."""
+    return {"log_probs": wild.given("logp"), "old_log_probs": wild.given("old_logp"), "advantages": wild.given("adv")}
+
+
+def _tokens_of_the_atlas(_generator):
+    kept = wild.given("mask")
+    names = {"log_probs": "tok_logp", "old_log_probs": "tok_old", "advantages": "tok_adv"}
+    return {name: wild.given(part)[kept] for name, part in names.items()}
+
+
+def _minimum_prefers_the_clip(r, a, e):
+    return r.clamp(1 - e, 1 + e) * a < r * a
+
+
+def _gradient_vanishes(rule, new, old, advantages, e):
+    """Asks autograd, sample by sample, what the clip has left."""
+    ratio = (new - old).exp()
+    if rule == "outside":
+        return torch.ne(ratio, ratio.clamp(1 - e, 1 + e)).to(new.dtype).mean()
+    given = ratio.detach().requires_grad_()
+    terms = torch.minimum(given * advantages, given.clamp(1 - e, 1 + e) * advantages)
+    (gradient,) = torch.autograd.grad(terms.sum(), given)
+    return ((gradient == 0) & (advantages != 0)).to(new.dtype).mean()
+
+
+def _fractions_one_by_one(rule, new, old, advantages, e):
+    count = 0
+    for n, o, a in zip(new.tolist(), old.tolist(), advantages.tolist(), strict=True):
+        excess = math.exp(n - o) - 1
+        count += abs(excess) > e if rule == "outside" else (excess > e if a > 0 else a < 0 and -excess > e)
+    return torch.tensor(count / len(new), dtype=new.dtype)
+
+
+def _fractions_numpy(rule, new, old, advantages, e):
+    moved = np.expm1((new - old).double().numpy())
+    counted = np.abs(moved) > e if rule == "outside" else np.sign(advantages.numpy()) * moved > e
+    return torch.tensor(counted.mean(), dtype=new.dtype)
+
+
+def _knowing(formula):
+    """The same with the names checked first."""
+    known = satisfies(lambda rule: rule in _KNOWN_FRACTIONS)
+    return versions_of(ch43.clip_fraction_as, known, one_shape(*TRIPLE), _NOT_NEGATIVE, data=TRIPLE)(formula)
+
+
+_WRONG_FRACTION_RULES = {
+    "outside-by-either-rule": (
+        _counted(silenced=lambda r, a, e: _is_outside(r, e)),
+        "Both rules count what is outside. “silenced” leaves out samples on the wrong side of their advantage, which still pull."
+        + _SILENCED_BY,
+    ),
+    "silenced-by-either-rule": (
+        lambda rule, *given, **named: _counted()("silenced" if rule == "outside" else rule, *given, **named),
+        "Both rules count what the clip silences. “outside” asks for the ratio alone, whatever the advantage."
+        + wild.also("", "clip_fraction", what="“outside” is"),
+    ),
+    "rules-swapped": (
+        lambda rule, *given, **named: _counted()({"outside": "silenced", "silenced": "outside"}.get(rule, rule), *given, **named),
+        "The rules are the wrong way round: “silenced” is the one that needs the advantages.",
+    ),
+    "those-that-still-pull": (
+        _counted(silenced=lambda r, a, e: clip_silences(r, -a, e)),
+        "These samples are outside and still pull, back to the interval. Silent are good actions above it and bad ones below.",
+    ),
+    "good-actions-only": (
+        _counted(silenced=lambda r, a, e: (a > 0) & (r > 1 + e)),
+        "Only good actions are counted as silenced: bad ones below 1 - ε have lost their gradient, too.",
+    ),
+    "bad-actions-only": (
+        _counted(silenced=lambda r, a, e: (a < 0) & (r < 1 - e)),
+        "Only bad actions are counted as silenced: good ones above 1 + ε have lost their gradient, too.",
+    ),
+    "no-advantage-counts": (
+        _counted(silenced=lambda r, a, e: ((a >= 0) & (r > 1 + e)) | ((a <= 0) & (r < 1 - e))),
+        "An advantage of 0 gives no gradient that the clip could take away: compare with < and >.",
+    ),
+    "share-of-those-outside": (
+        _counted(
+            silenced=lambda r, a, e: clip_silences(r, a, e).to(r.dtype) * len(r) / _is_outside(r, e).sum().clamp(min=1),
+        ),
+        "This is the share among those outside: divide by the whole batch.",
+    ),
+    "ratio-inverted": (_counted(ratio=_inverted), _INVERTED),
+    "range-on-log-ratio": (
+        _counted(lambda r, e: r.log().abs() > e, lambda r, a, e: a.sign() * r.log() > e),
+        _LOG_RANGE,
+    ),
+    "clip-range-ignored": (_counted(lambda r, e: _is_outside(r, 0.2), lambda r, a, e: clip_silences(r, a, 0.2)), _RANGE),
+    "graph-kept": (
+        _counted(
+            lambda r, e: ((r - 1).abs() - e).relu().sign(), lambda r, a, e: (a.sign() * (r - 1) - e).relu().sign(), leak=True
+        ),
+        METRIC,
+    ),
+    "unknown-rule-accepted": (
+        _counted(known=_Anything()),
+        "A rule that is neither of the two is taken for one of them (an else?): refuse it, and say so by name.",
+    ),
+}
+
+CLIP_FRACTION_AS = Exercise(
+    name="clip_fraction_as",
+    reference=ch43.clip_fraction_as,
+    criteria={"values": 0.7, "gradient": 0.05, "dtype": 0.05, "inputs": 0.05, "errors": 0.15},
+    cases=(
+        *(
+            case
+            for rule in _KNOWN_FRACTIONS
+            for case in (
+                Case(f"“{rule}”: a batch, default clip_range", _by(rule, _batch()), visible=True, draws=3),
+                Case(f"“{rule}”: the four cases outside", _by(rule, _four_cases), closed_form=_zero_for_outside, visible=True),
+                Case(f"“{rule}”: identical policies", _by(rule, _constant(0.0)), visible=True, draws=1),
+                Case(f"“{rule}”: clip_range = 0.05", _by(rule, _batch(clip_range=0.05)), visible=True, draws=1),
+                Case(f"“{rule}”: clip_range = 0", _by(rule, _batch(clip_range=0)), draws=1),
+                Case(f"“{rule}”: clip_range = infinity, one advantage is 0", _by(rule, _zero_advantage), draws=1),
+                Case(f"“{rule}”: clip_range = 1.5", _by(rule, _batch(spread=1.0, clip_range=1.5)), draws=1),
+                Case(f"“{rule}”: no advantage at all", _by(rule, _no_gain), visible=True, draws=1),
+                Case(f"“{rule}”: all inputs require gradient", _by(rule, _batch()), differentiate=TRIPLE, visible=True, draws=1),
+                Case(f"“{rule}”: single precision", _by(rule, _batch()), dtype=torch.float32, visible=True, draws=1),
+            )
+        ),
+        Case(
+            "“outside”: what Stable-Baselines3 logged",
+            _by("outside", _minibatch_of_the_atlas),
+            closed_form=lambda **_given: wild.numbers("stable-baselines3", "clip_fraction"),
+            visible=True,
+            draws=1,
+        ),
+        Case(
+            "“silenced”: what verl logged",
+            _by("silenced", _tokens_of_the_atlas),
+            closed_form=lambda **_given: wild.numbers("verl", "token_clip_fraction", "silenced"),
+            visible=True,
+            draws=1,
+        ),
+        *_shape_cases(_by("silenced", _batch()), TRIPLE),
+        refused(_by("silenced", _batch()), rule="clipped", visible=True),
+        refused(_by("outside", _batch()), clip_range=-0.1, visible=True),
+        refused(_by("silenced", _batch()), clip_range=-0.1),
+    ),
+    misconceptions=(
+        *wrong(_WRONG_FRACTION_RULES),
+        python_float(ch43.clip_fraction_as, NUMBER),
+        dtype_lost(ch43.clip_fraction_as),
+        bad_input_accepted(_counted(known=_Anything(), checked=False)),
+    ),
+    variants={
+        "where min takes the clipped term": _counted(lambda r, e: r != r.clamp(1 - e, 1 + e), _minimum_prefers_the_clip),
+        "the sign of the advantage": _counted(silenced=lambda r, a, e: a.sign() * (r - 1) > e),
+        "what autograd leaves": _knowing(_gradient_vanishes),
+        "one number at a time": _knowing(_fractions_one_by_one),
+        "NumPy": _knowing(_fractions_numpy),
+    },
+)
+
+# ----------------------------------------------------------------------------------------------------- which_diagnostics
+
+
+def _k1(r):
+    return -r.log().mean()
+
+
+def _computed(r, a, e):
+    """The four numbers that may have been logged."""
+    fractions = (_is_outside(r, e), clip_silences(r, a, e))
+    return [_k1(r), (r - 1 - r.log()).mean(), *(counted.to(r.dtype).mean() for counted in fractions)]
+
+
+def _near(logged, computed):
+    return (logged - computed).abs() <= 1e-5 * logged.abs().clamp(min=1)
+
+
+def _told(fits=_near, computed=_computed, order=(0, 1, 2, 3), ratio=_ratio, **options):
+    """A version of the reading: `computed` gives the four numbers, `fits` compares one with what was logged under its name."""
+
+    def reading(kl, fraction, new, old, advantages, e):
+        logged, numbers = (kl, kl, fraction, fraction), computed(ratio(new, old), advantages, e)
+        return torch.stack([torch.as_tensor(fits(logged[k], numbers[k])) for k in order])
+
+    return versions_of(ch43.which_diagnostics, one_shape(*TRIPLE), _NOT_NEGATIVE, data=TRIPLE)(reading, **options)
+
+
+def _nearest(kl, fraction, new, old, advantages, e):
+    k1, k3, outside, silenced = _computed(_ratio(new, old), advantages, e)
+    first, third = (kl - k1).abs() < (kl - k3).abs(), (fraction - outside).abs() < (fraction - silenced).abs()
+    return torch.stack([first, ~first, third, ~third])
+
+
+@drawing
+def _log(generator, kl=0, fraction=0, by=(0.0, 0.0), **settings):
+    """A batch, and what a program logged of it: numbers 0 or 1 of either pair, each `by` so much off, rounded to single precision."""
+    drawn = _batch(**settings)(generator)
+    ratio = _ratio(drawn["log_probs"], drawn["old_log_probs"])
+    numbers = _computed(ratio, drawn["advantages"], settings.get("clip_range", 0.2))
+    logged = numbers[kl] + by[0], numbers[2 + fraction] + by[1]
+    kl_seen, fraction_seen = (number.float().double() for number in logged)
+    return {"logged_kl": kl_seen, "logged_fraction": fraction_seen, **drawn}
+
+
+def _standstill_log(generator):
+    nothing = torch.zeros((), dtype=torch.float64)
+    return {"logged_kl": nothing, "logged_fraction": nothing, **_constant(0.0)(generator)}
+
+
+@drawing
+def _log_of_the_atlas(_generator, library, rules, inputs, names):
+    kl, fraction = (wild.numbers(library, name, rule) for name, rule in zip(names, rules, strict=True))
+    return {"logged_kl": kl, "logged_fraction": fraction, **inputs(None)}
+
+
+_SAMPLES, _TOKENS = ("approx_kl", "clip_fraction"), ("token_approx_kl", "token_clip_fraction")
+
+
+def _fit(*which):
+    """A closed form: these of the four."""
+    return lambda **_given: torch.tensor([k in which for k in range(4)])
+
+
+def _told_one_by_one(kl, fraction, new, old, advantages, e):
+    logs = [n - o for n, o in zip(new.tolist(), old.tolist(), strict=True)]
+    silent = [
+        math.exp(d) > 1 + e if a > 0 else a < 0 and math.exp(d) < 1 - e for d, a in zip(logs, advantages.tolist(), strict=True)
+    ]
+    outside = [abs(math.exp(d) - 1) > e for d in logs]
+    totals = (sum(-d for d in logs), sum(math.exp(d) - 1 - d for d in logs), sum(outside), sum(silent))
+    seen = [kl.item(), kl.item(), fraction.item(), fraction.item()]
+    return torch.tensor([abs(s - total / len(logs)) <= 1e-5 * max(1, abs(s)) for s, total in zip(seen, totals, strict=True)])
+
+
+_WRONG_READINGS = {
+    "equal-to-the-last-bit": (
+        _told(lambda logged, computed: logged == computed),
+        "A log is rounded to single precision: compare the distance with the tolerance, not the numbers with ==.",
+    ),
+    "only-the-nearest": (
+        versions_of(ch43.which_diagnostics, one_shape(*TRIPLE), _NOT_NEGATIVE, data=TRIPLE)(_nearest),
+        "The nearest of two rules is called the one. Both may fit, or neither: compare each with the tolerance by itself.",
+    ),
+    "distance-without-abs": (
+        _told(lambda logged, computed: logged - computed <= 1e-5 * logged.abs().clamp(min=1)),
+        "A logged number far below the computed one passes, too: take the absolute value of the difference.",
+    ),
+    "far-too-tolerant": (
+        _told(lambda logged, computed: (logged - computed).abs() <= 0.03),
+        "Numbers that are a hundredth apart come from different rules: the tolerance is 1e-5, for rounding alone.",
+    ),
+    "k1-and-k3-swapped": (_told(order=(1, 0, 2, 3)), "k1 comes first, the mean of -log ρ, and k3 second."),
+    "fractions-swapped": (_told(order=(0, 1, 3, 2)), "“outside” comes before “silenced”."),
+    "k1-with-the-wrong-sign": (
+        _told(computed=lambda r, a, e: [-_k1(r), *_computed(r, a, e)[1:]]),
+        "k1 is the mean of -log ρ, old minus new log-probabilities: its sign can be either, but not this one.",
+    ),
+    "k1-never-negative": (
+        _told(computed=lambda r, a, e: [_k1(r).abs(), *_computed(r, a, e)[1:]]),
+        "k1 may be negative, and some libraries log it so: no absolute value, no clamp."
+        + wild.also("k1", "approx_kl", "token_approx_kl", what="k1 is"),
+    ),
+    "outside-by-either-rule": (
+        _told(computed=lambda r, a, e: [*_computed(r, a, e)[:3], _computed(r, a, e)[2]]),
+        "The fourth entry asks for the silent fraction, which needs the advantages." + _SILENCED_BY,
+    ),
+    "ratio-inverted": (_told(ratio=_inverted), _INVERTED),
+    "clip-range-ignored": (_told(computed=lambda r, a, e: _computed(r, a, 0.2)), _RANGE),
+    "one-answer-for-each-number": (
+        after(ch43.which_diagnostics, lambda told: told.reshape(2, 2).any(1)),
+        "This says whether any rule fits each number. Which one does is asked for: four answers.",
+    ),
+}
+
+WHICH_DIAGNOSTICS = Exercise(
+    name="which_diagnostics",
+    reference=ch43.which_diagnostics,
+    criteria={"values": 0.9, "inputs": 0.05, "errors": 0.05},
+    axes=("rule",),
+    cases=(
+        *(
+            Case(f"{name} and “{_KNOWN_FRACTIONS[fraction]}”, from a log", _log(kl=kl, fraction=fraction), visible=True)
+            for kl, name in enumerate(("k1", "k3"))
+            for fraction in (0, 1)
+        ),
+        Case("a small step, k1", _log(spread=0.01), visible=True, draws=3),
+        Case("a large clip_range", _log(kl=1, fraction=1, spread=1.0, clip_range=0.6)),
+        Case("identical policies: all fit", _standstill_log, closed_form=_fit(0, 1, 2, 3), visible=True, draws=1),
+        Case("a KL by no rule", _log(by=(2e-3, 0.0)), visible=True),
+        Case("numbers by no rule, both below", _log(kl=1, by=(-0.9, -1.5)), closed_form=_fit(), visible=True, draws=1),
+        Case("numbers by no rule, both above", _log(kl=1, by=(0.9, 1.5)), closed_form=_fit(), draws=1),
+        Case(
+            "what Stable-Baselines3 logged",
+            _log_of_the_atlas("stable-baselines3", ("", ""), _minibatch_of_the_atlas, _SAMPLES),
+            closed_form=_fit(1, 2),
+            visible=True,
+            draws=1,
+        ),
+        Case(
+            "what TorchRL logged",
+            _log_of_the_atlas("torchrl", ("k1", ""), _minibatch_of_the_atlas, _SAMPLES),
+            closed_form=_fit(0, 2),
+            visible=True,
+            draws=1,
+        ),
+        Case(
+            "what verl logged",
+            _log_of_the_atlas("verl", ("k1", "silenced"), _tokens_of_the_atlas, _TOKENS),
+            closed_form=_fit(0, 3),
+            visible=True,
+            draws=1,
+        ),
+        Case("inputs that require gradient", _log(), differentiate=TRIPLE, visible=True, draws=1),
+        Case("single precision", _log(fraction=1), dtype=torch.float32, visible=True),
+        *_shape_cases(_log(), TRIPLE),
+        refused(_log(), clip_range=-0.1, visible=True),
+    ),
+    misconceptions=(
+        *wrong(_WRONG_READINGS),
+        bad_input_accepted(_told(checked=False)),
+        in_place(ch43.which_diagnostics, "log_probs", 2),
+    ),
+    variants={
+        "torch.isclose": _told(
+            lambda logged, computed: torch.isclose(computed, logged, rtol=0, atol=1e-5 * max(1.0, logged.abs().item()))
+        ),
+        "one number at a time": versions_of(ch43.which_diagnostics, one_shape(*TRIPLE), _NOT_NEGATIVE)(_told_one_by_one),
+        "in double precision": _told(lambda logged, computed: _near(logged.double(), computed.double())),
+        "the distance over its scale": _told(
+            lambda logged, computed: (logged - computed).abs() / torch.maximum(logged.abs(), torch.ones_like(logged)) <= 1e-5
+        ),
+    },
+)
+
 # ------------------------------------------------------------------------------------------------------- repaired_losses
 
 
@@ -835,4 +1217,13 @@ REPAIRED_LOSSES = Exercise(
     },
 )
 
-EXERCISES = (IMPORTANCE_RATIO, SURROGATE_LOSS, CLIPPED_SURROGATE_LOSS, APPROX_KL, CLIP_FRACTION, REPAIRED_LOSSES)
+EXERCISES = (
+    IMPORTANCE_RATIO,
+    SURROGATE_LOSS,
+    CLIPPED_SURROGATE_LOSS,
+    APPROX_KL,
+    CLIP_FRACTION,
+    CLIP_FRACTION_AS,
+    WHICH_DIAGNOSTICS,
+    REPAIRED_LOSSES,
+)

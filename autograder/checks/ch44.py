@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
+from autograder.authoring import wild
 from autograder.authoring.parts import (
     METRIC,
     NUMBER,
@@ -397,7 +399,8 @@ def _in_own_buffer(rewards, values, next_values, terminated, truncated, gamma, g
 _WRONG_GAE = {
     "truncated-treated-as-terminated": (
         _gae(no_bootstrap=_at_either),
-        "A time limit does not end the task: bootstrap from next_values there. Only terminated removes the bootstrap.",
+        "A time limit does not end the task: bootstrap from next_values there. Only terminated removes the bootstrap."
+        + wild.also("truncation_as_end", "gae"),
     ),
     "termination-ignored": (_gae(no_bootstrap=_never), _NOTHING_FOLLOWS),
     "recursion-runs-through-truncation": (
@@ -808,6 +811,594 @@ EXPLAINED_VARIANCE = Exercise(
     },
 )
 
+# ---------------------------------------------------------------------------------------------------------------- gae_as
+
+RULES = ("textbook", "termination", "leak", "current_value", "dropped")
+_RECORDED = {  # the rule's name in the atlas, and the library whose numbers are looked at
+    "textbook": ("", "stable-baselines3"),
+    "termination": ("truncation_as_end", "cleanrl"),
+    "leak": ("truncation_ignored", "skrl"),
+    "current_value": ("current_value_even_at_an_end", "rsl-rl-lib"),
+    "dropped": ("truncated_step_dropped", "brax"),
+}
+_WILD = (*FLOATS, "last_values")
+
+
+def _followers(rule, what="this is"):
+    return wild.also(_RECORDED[rule][0], "gae", what=what)
+
+
+@drawing
+def _wild_rollout(generator, **ends):
+    """A rollout with the value of the observation from which the next one starts."""
+    rollout = _rollout(generator, **ends)
+    ended = rollout["terminated"][-1] | rollout["truncated"][-1]
+    last_values = torch.where(ended, normal(generator, len(ended)), rollout["next_values"][-1])
+    return _in_order(rollout, last_values, gamma=0.9, gae_lambda=0.8)
+
+
+def _in_order(rollout, last_values, **scalars):
+    """In the order of the signature."""
+    return {
+        **{name: rollout[name] for name in FLOATS},
+        "last_values": last_values,
+        "terminated": rollout["terminated"],
+        "truncated": rollout["truncated"],
+        **scalars,
+    }
+
+
+@drawing
+def _wild_end(generator, *flags):
+    at = [_position(generator, 8, 3)]
+    return _wild_rollout(**{f"{flag}_at": at for flag in flags})(generator)
+
+
+_wild_ends = _wild_rollout(
+    steps=24, envs=4, terminated_at=[(5, 0), (23, 1), (9, 2)], truncated_at=[(7, 1), (15, 2), (23, 3), (9, 2)], rate=0.08
+)
+
+
+def _rollout_of_the_atlas(_generator):
+    """The rollout that the libraries were given, time first."""
+    part = {name: wild.given(name).T for name in ("rewards", "values", "terminated", "truncated", "final_values")}
+    last_values = wild.given("last_values")
+    following = torch.cat([part["values"][1:], last_values[None]])
+    rollout = part | {"next_values": torch.where(part["terminated"] | part["truncated"], part["final_values"], following)}
+    return _in_order(rollout, last_values, gamma=0.99, gae_lambda=0.95)
+
+
+def _recorded(rule):
+    """What a library that follows the rule gave for that rollout."""
+    name, library = _RECORDED[rule]
+    return wild.numbers(library, "gae", name).T
+
+
+def _by(rule, inputs):
+    return lambda generator: {"rule": rule, **inputs(generator)}
+
+
+def _next_row(values, last_values):
+    return torch.cat([values[1:], last_values[None]])
+
+
+@dataclass(frozen=True)
+class _Rollout:
+    """What a rule sees, with the settings."""
+
+    rewards: torch.Tensor
+    values: torch.Tensor
+    next_values: torch.Tensor
+    last_values: torch.Tensor
+    terminated: torch.Tensor
+    truncated: torch.Tensor
+    gamma: float
+    gae_lambda: float
+
+    @property
+    def ended(self):
+        return self.terminated | self.truncated
+
+    @property
+    def following(self):
+        return _next_row(self.values, self.last_values)
+
+    def residuals(self, following, alive):
+        return _residual(self.rewards, self.values, following, alive, self.gamma)
+
+    def summed(self, deltas, stop):
+        return _backward(deltas, self.gamma * self.gae_lambda * (~stop).to(deltas.dtype))
+
+    def but(self, **changes):
+        return replace(self, **changes)
+
+
+def _textbook(x):
+    return x.summed(x.residuals(x.next_values, ~x.terminated), x.ended)
+
+
+def _termination(x):
+    return x.summed(x.residuals(x.following, ~x.ended), x.ended)
+
+
+def _leak(x):
+    return x.summed(x.residuals(x.following, ~x.terminated), x.terminated)
+
+
+def _current_value(x):
+    return _termination(x.but(rewards=x.rewards + x.gamma * x.values * x.truncated))
+
+
+def _sums_without_dropped(x):
+    deltas = torch.where(x.truncated, torch.zeros_like(x.rewards), x.residuals(x.following, ~x.ended))
+    return x.summed(deltas, x.ended)
+
+
+def _dropped(x, sums=_sums_without_dropped):
+    targets = _next_row(x.values + sums(x), x.last_values)
+    return torch.where(x.truncated, torch.zeros_like(targets), x.residuals(targets, ~x.terminated))
+
+
+_BY_RULE = {
+    "textbook": _textbook,
+    "termination": _termination,
+    "leak": _leak,
+    "current_value": _current_value,
+    "dropped": _dropped,
+}
+
+
+def _last_row(given):
+    """Raises ValueError unless there is a last value for each environment."""
+    if given["last_values"].shape != given["rewards"].shape[1:]:
+        raise ValueError("last_values: one for each environment")
+
+
+def _named_rule(given):
+    if given["rule"] not in RULES:
+        raise ValueError(f"rule is none of the five: {given['rule']}")
+
+
+_ruled = versions_of(ch44.gae_as, _named_rule, one_shape(*ROLLOUT), _last_row, _GAMMA, _LAMBDA, data=_WILD)
+
+
+def _gae_as(other="textbook", **changed):
+    """A version of the five rules, some of them changed; `other` is the rule that stands in for names that are none."""
+    by_rule = _BY_RULE | changed
+    return lambda rule, *given: by_rule.get(rule, by_rule[other])(_Rollout(*given))
+
+
+def _wild_by_hand(rule, rewards, values, next_values, last_values, terminated, truncated, gamma, gae_lambda):
+    """Plain Python, an environment at a time, each rule by its own words."""
+    steps, envs = rewards.shape
+    out = [[0.0] * envs for _ in range(steps)]
+    for env in range(envs):
+        r, v, n, stop, cut = (x[:, env].tolist() for x in (rewards, values, next_values, terminated, truncated))
+        after_row = [*v[1:], last_values[env].item()]
+        running, sums = 0.0, [0.0] * steps
+        for t in range(steps - 1, -1, -1):
+            reward = r[t] + (gamma * v[t] if rule == "current_value" and cut[t] else 0.0)
+            if rule in ("textbook", "leak"):
+                future = 0.0 if stop[t] else gamma * (n[t] if rule == "textbook" else after_row[t])
+                carried = not (stop[t] or (cut[t] and rule == "textbook"))
+            else:
+                future, carried = 0.0 if stop[t] or cut[t] else gamma * after_row[t], not (stop[t] or cut[t])
+            running = 0.0 if rule == "dropped" and cut[t] else reward + future - v[t] + gamma * gae_lambda * running * carried
+            sums[t] = running
+        for t in range(steps):
+            target = last_values[env].item() if t == steps - 1 else v[t + 1] + sums[t + 1]
+            ahead = 0.0 if cut[t] else r[t] + (0.0 if stop[t] else gamma * target) - v[t]
+            out[t][env] = ahead if rule == "dropped" else sums[t]
+    return torch.tensor(out, dtype=rewards.dtype)
+
+
+def _wild_by_compute_gae(rule, rewards, values, next_values, last_values, terminated, truncated, gamma, gae_lambda):
+    """Everything by way of compute_gae, truncated steps left out by a reward."""
+    never, ended = torch.zeros_like(truncated), terminated.logical_or(truncated)
+    settings = {"gamma": gamma, "gae_lambda": gae_lambda}
+    if rule == "textbook":
+        return ch44.compute_gae(rewards, values, next_values, terminated, truncated, **settings)
+    behind = torch.roll(values, -1, 0)
+    behind[-1] = last_values
+    if rule == "leak":
+        return ch44.compute_gae(rewards, values, behind, terminated, never, **settings)
+    extra = {"current_value": gamma * values, "dropped": values - rewards}.get(rule, torch.zeros_like(values))
+    sums = ch44.compute_gae(torch.where(truncated, rewards + extra, rewards), values, behind, ended, never, **settings)
+    if rule != "dropped":
+        return sums
+    targets = torch.roll(values + sums, -1, 0)
+    targets[-1] = last_values
+    return ch44.compute_gae(rewards, values, targets, terminated, never, gamma, 0.0).masked_fill(truncated, 0.0)
+
+
+def _wild_in_numpy(rule, *given):
+    """NumPy in double precision, factors of each rule in a table."""
+    *floats, terminated, truncated, gamma, gae_lambda = given
+    r, v, n, last = (x.double().numpy() for x in floats)
+    stop, cut = terminated.numpy(), truncated.numpy()
+    end = stop | cut
+    behind = np.concatenate([v[1:], last[None]])
+    reward, future, carried = {
+        "textbook": (r, np.where(stop, 0, n), ~end),
+        "termination": (r, np.where(end, 0, behind), ~end),
+        "leak": (r, np.where(stop, 0, behind), ~stop),
+        "current_value": (r + gamma * v * cut, np.where(end, 0, behind), ~end),
+        "dropped": (np.where(cut, v, r), np.where(end, 0, behind), ~end),
+    }[rule]
+    deltas, sums, running = reward + gamma * future - v, np.zeros_like(v), np.zeros_like(last)
+    for t in reversed(range(len(v))):
+        running = deltas[t] + gamma * gae_lambda * carried[t] * running
+        sums[t] = running
+    if rule == "dropped":
+        targets = np.concatenate([(v + sums)[1:], last[None]])
+        sums = np.where(cut, 0.0, r + gamma * targets * ~stop - v)
+    return torch.from_numpy(sums).to(given[0].dtype)
+
+
+_TAKEN_FOR = "This gives “{}” the numbers of “{}”: "
+
+_WRONG_RULES = {
+    "always-textbook": (
+        _gae_as(**dict.fromkeys(RULES, _textbook)),
+        "Every rule gives the numbers of compute_gae: its words say what it does otherwise." + _followers("textbook"),
+    ),
+    "leak-taken-for-termination": (
+        _gae_as(leak=_termination),
+        _TAKEN_FOR.format("leak", "termination")
+        + "a time limit counted as an end. A time limit that is not seen stops nothing: the next row's value and sum go on."
+        + _followers("termination"),
+    ),
+    "termination-taken-for-leak": (
+        _gae_as(termination=_leak),
+        _TAKEN_FOR.format("termination", "leak")
+        + "the next episode leaks in. An end bootstraps nothing and stops the sum."
+        + _followers("leak"),
+    ),
+    "current-value-taken-for-termination": (
+        _gae_as(current_value=_termination),
+        _TAKEN_FOR.format("current_value", "termination")
+        + "a time limit counted as an end. Before that, γ V(s_t) is added to the truncated step's reward."
+        + _followers("termination"),
+    ),
+    "dropped-taken-for-termination": (
+        _gae_as(dropped=_termination),
+        _TAKEN_FOR.format("dropped", "termination")
+        + "a time limit counted as an end. The step itself has no advantage at all."
+        + _followers("termination"),
+    ),
+    "leak-cut": (
+        _gae_as(leak=lambda x: x.summed(x.residuals(x.following, ~x.terminated), x.ended)),
+        "“leak”: the next episode's value stands in, but the sum stops at the time limit, which this rule does not see.",
+    ),
+    "leak-with-the-true-successor": (
+        _gae_as(leak=lambda x: x.summed(x.residuals(x.next_values, ~x.terminated), x.terminated)),
+        "“leak”: the sum runs on, but the value is that of the true successor. This rule reads row t + 1, whatever it holds.",
+    ),
+    "leak-through-terminations": (
+        _gae_as(leak=lambda x: x.summed(x.residuals(x.following, ~x.terminated), torch.zeros_like(x.ended))),
+        "“leak” does not see time limits; an end of the task it does see, and stops there.",
+    ),
+    "final-value-added": (
+        _gae_as(current_value=lambda x: _termination(x.but(rewards=x.rewards + x.gamma * x.next_values * x.truncated))),
+        "“current_value”: the value added is next_values, of the observation after the step; this rule adds values, of the one before.",
+    ),
+    "current-value-not-at-an-end": (
+        _gae_as(
+            current_value=lambda x: _termination(x.but(rewards=x.rewards + x.gamma * x.values * (x.truncated & ~x.terminated)))
+        ),
+        "“current_value”: where a step is both terminated and truncated, this rule adds the value all the same.",
+    ),
+    "current-value-undiscounted": (
+        _gae_as(current_value=lambda x: _termination(x.but(rewards=x.rewards + x.values * x.truncated))),
+        "“current_value”: what is added is γ V(s_t); here γ is missing.",
+    ),
+    "current-value-at-every-end": (
+        _gae_as(current_value=lambda x: _termination(x.but(rewards=x.rewards + x.gamma * x.values * x.ended))),
+        "“current_value”: a value is added where the task ended as well. Only truncated steps get one.",
+    ),
+    "dropped-step-only": (
+        _gae_as(dropped=lambda x: torch.where(x.truncated, torch.zeros_like(x.rewards), _termination(x))),
+        "“dropped”: the truncated step is 0, but the steps before it still carry its residual, and all look further than one step ahead.",
+    ),
+    "dropped-without-the-look-ahead": (
+        _gae_as(dropped=_sums_without_dropped),
+        "“dropped”: these are the sums A. The advantage is one step ahead of a target that holds them: r + γ G - V.",
+    ),
+    "dropped-sums-with-its-residual": (
+        _gae_as(dropped=lambda x: _dropped(x, _termination)),
+        "“dropped”: the target of the truncated row is V alone, as its δ is 0; here its reward is still in it.",
+    ),
+    "last-values-ignored": (
+        _gae_as(**{name: lambda x, by=by: by(x.but(last_values=x.next_values[-1])) for name, by in _BY_RULE.items()}),
+        "After the last row comes the observation from which the next rollout starts: last_values, not next_values[-1].",
+    ),
+}
+
+
+def _reward_raised_in_place(x):
+    return _termination(x.but(rewards=x.rewards.add_(x.gamma * x.values * x.truncated)))
+
+
+GAE_AS = Exercise(
+    name="gae_as",
+    reference=ch44.gae_as,
+    criteria={"values": 1.4, "gradient": 0.1, "dtype": 0.05, "inputs": 0.1, "errors": 0.1},
+    axes=("t", "env"),
+    last_step_first=True,
+    cases=(
+        *(
+            case
+            for rule in RULES
+            for case in (
+                Case(f"“{rule}”: a time limit cuts one episode", _by(rule, _wild_end("truncated")), visible=True, draws=1),
+                Case(f"“{rule}”: one episode terminates", _by(rule, _wild_end("terminated")), visible=True, draws=1),
+                Case(f"“{rule}”: both in the same step", _by(rule, _wild_end("terminated", "truncated")), visible=True, draws=1),
+                Case(f"“{rule}”: many ends", _by(rule, _wild_ends), closed_form=_wild_by_hand, visible=True, draws=2),
+                Case(
+                    f"“{rule}”: what {_RECORDED[rule][1]} computed",
+                    _by(rule, _rollout_of_the_atlas),
+                    closed_form=lambda rule, **_given: _recorded(rule),
+                    visible=True,
+                    draws=1,
+                ),
+                Case(
+                    f"“{rule}”: values that require gradient", _by(rule, _wild_ends), differentiate=_WILD, visible=True, draws=1
+                ),
+                Case(f"“{rule}”: single precision", _by(rule, _wild_ends), dtype=torch.float32, visible=True, draws=1),
+            )
+        ),
+        Case("“leak”: default gamma and gae_lambda", _by("leak", without(_wild_ends, "gamma", "gae_lambda")), draws=1),
+        Case("“dropped”: one step", _by("dropped", _wild_rollout(steps=1, envs=2)), draws=1),
+        refused(_by("leak", _wild_ends), rule="truncation", visible=True),
+        refused(_by("leak", _wild_ends), gamma=1.5, visible=True),
+        refused(_by("dropped", _wild_ends), gae_lambda=-0.1),
+        *(_cut(_by("current_value", _wild_ends), name, ROLLOUT, visible=name == "truncated") for name in ROLLOUT),
+        Case(
+            "last_values of one environment too few",
+            reshaped(_by("leak", _wild_ends), "last_values", lambda x: x[1:]),
+            raises=["last_values"],
+            visible=True,
+            draws=1,
+        ),
+    ),
+    misconceptions=(
+        *wrong(_WRONG_RULES, _ruled),
+        Misconception(
+            "unknown-rule-accepted",
+            versions_of(ch44.gae_as, one_shape(*ROLLOUT), _last_row, _GAMMA, _LAMBDA, data=_WILD)(_gae_as("dropped")),
+            "A name that is none of the five is taken for one of them (an else?): refuse it, and name the argument.",
+        ),
+        Misconception("graph-kept", _ruled(_gae_as(), leak=True), _DETACH),
+        Misconception("input-changed", _ruled(_gae_as(current_value=_reward_raised_in_place)), _BOOTSTRAPPED),
+        dtype_lost(ch44.gae_as),
+        bad_input_accepted(_ruled(_gae_as(), checked=False)),
+    ),
+    variants={
+        "a function for each rule": _ruled(_gae_as()),
+        "plain Python, environment by environment": _ruled(_wild_by_hand),
+        "by way of compute_gae alone": _ruled(_wild_by_compute_gae),
+        "NumPy, a table of factors": _ruled(_wild_in_numpy),
+    },
+)
+
+# ------------------------------------------------------------------------------------------------------------- which_gae
+
+
+_one_limit = _wild_end("truncated")
+
+
+@drawing
+def _logged(generator, rule, inputs=_one_limit, off=0.0, scale=1.0, noise=0.0, rules=RULES, at=None):
+    """What a program that follows a rule has logged, in single precision; `off` is how much too large one entry is, `noise` how far
+    rounding has taken each."""
+    given = inputs(generator)
+    if scale != 1:
+        given |= {name: scale * given[name] for name in _WILD}
+    advantages = _BY_RULE[rule](_Rollout(*given.values()))
+    advantages = advantages + noise * normal(generator, *advantages.shape).sign()
+    entry = _position(generator, *advantages.shape) if at is None else at
+    advantages[entry] += off
+    return {"logged": advantages.float().double(), "rules": list(rules), **given}
+
+
+@drawing
+def _logged_in_the_atlas(_generator, rule):
+    return {"logged": _recorded(rule), "rules": list(RULES), **_rollout_of_the_atlas(None)}
+
+
+def _only(*rules, of=RULES):
+    """A closed form: these of the names."""
+    return lambda **_given: torch.tensor([name in rules for name in of])
+
+
+def _two_envs_apart(generator):
+    """Environment 0 has no time limit: there, most rules agree."""
+    return _wild_rollout(steps=10, envs=2, truncated_at=[(4, 1)])(generator)
+
+
+def _which(fits, checked=True, **options):
+    """A version of the reading: `fits` compares the logged advantages with those by one rule."""
+
+    def reading(logged, rules, *given):
+        return torch.stack([torch.as_tensor(fits(logged, _computed_as(rule, given, checked))) for rule in rules])
+
+    checks = (one_shape("logged", *ROLLOUT), _last_row, _GAMMA, _LAMBDA) if checked else ()
+    return versions_of(ch44.which_gae, *checks, data=("logged", *_WILD))(reading, **options)
+
+
+def _computed_as(rule, given, checked=True):
+    if checked and rule not in RULES:
+        raise ValueError(f"rules: {rule} is none of the five")
+    return _BY_RULE.get(rule, _textbook)(_Rollout(*given))
+
+
+def _scale(logged):
+    return logged.abs().max().clamp(min=1)
+
+
+def _fits(logged, computed):
+    return (logged - computed).abs().max() <= 1e-4 * _scale(logged)
+
+
+def _nearest_rule(logged, rules, *given):
+    gaps = torch.stack([(logged - _computed_as(rule, given)).abs().max() for rule in rules])
+    return torch.arange(len(rules)) == gaps.argmin()
+
+
+def _in_the_usual_order(logged, rules, *given):
+    return torch.stack([_fits(logged, _computed_as(rule, given)) for rule in sorted(rules, key=RULES.index)])
+
+
+def _first_that_fits(logged, rules, *given):
+    told = [bool(_fits(logged, _computed_as(rule, given))) for rule in rules]
+    return torch.tensor([fit and not any(told[:k]) for k, fit in enumerate(told)])
+
+
+def _entry_by_entry(logged, rules, *given):
+    tolerance = 1e-4 * max(1.0, max(abs(x) for row in logged.tolist() for x in row))
+    told = []
+    for rule in rules:
+        pairs = zip(logged.flatten().tolist(), _computed_as(rule, given).flatten().tolist(), strict=True)
+        told.append(all(abs(x - y) <= tolerance for x, y in pairs))
+    return torch.tensor(told)
+
+
+def _all_at_once(logged, rules, *given):
+    table = torch.stack([_computed_as(rule, given) for rule in rules])
+    return (table - logged).flatten(1).abs().amax(1) <= 1e-4 * torch.maximum(logged.abs().max(), torch.ones_like(logged[0, 0]))
+
+
+_readings = versions_of(ch44.which_gae, one_shape("logged", *ROLLOUT), _last_row, _GAMMA, _LAMBDA, data=("logged", *_WILD))
+
+_WRONG_READINGS = {
+    "equal-to-the-last-bit": (
+        _which(lambda logged, computed: (logged == computed).all()),
+        "A log is rounded to single precision: compare the largest difference with the tolerance, not the numbers with ==.",
+    ),
+    "only-the-nearest": (
+        _readings(_nearest_rule),
+        "The nearest rule is called the one. Several may fit, or none: compare each with the tolerance by itself.",
+    ),
+    "first-that-fits": (_readings(_first_that_fits), "Where several rules fit, all of them are the answer, not the first."),
+    "some-entry-fits": (
+        _which(lambda logged, computed: (logged - computed).abs().min() <= 1e-4 * _scale(logged)),
+        "One entry that agrees proves nothing: most rules agree far from a time limit. Every entry has to.",
+    ),
+    "mean-difference": (
+        _which(lambda logged, computed: (logged - computed).abs().mean() <= 1e-4 * _scale(logged)),
+        "A mean hides one entry that is off among many that are right: take the largest difference.",
+    ),
+    "difference-without-abs": (
+        _which(lambda logged, computed: (logged - computed).max() <= 1e-4 * _scale(logged)),
+        "Entries far below the computed ones pass, too: take the absolute value first.",
+    ),
+    "first-environment-only": (
+        _which(lambda logged, computed: _fits(logged[:, :1], computed[:, :1])),
+        "Only the first environment is looked at: the time limit may be in another one.",
+    ),
+    "first-step-only": (
+        _which(lambda logged, computed: _fits(logged[:1], computed[:1])),
+        "Only the first step is looked at: a rule may show at its time limit and nowhere before.",
+    ),
+    "tolerance-of-each-entry": (
+        _which(lambda logged, computed: ((logged - computed).abs() <= 1e-4 * logged.abs()).all()),
+        "The tolerance shrinks with each entry, and near 0 rounding alone exceeds it: scale it by the largest entry, by 1 at least.",
+    ),
+    "tolerance-not-scaled": (
+        _which(lambda logged, computed: (logged - computed).abs().max() <= 1e-4),
+        "Rounding grows with the numbers: where entries are above 1, the tolerance is 1e-4 times the largest.",
+    ),
+    "far-too-tolerant": (
+        _which(lambda logged, computed: (logged - computed).abs().max() <= 0.1 * _scale(logged)),
+        "A tenth is no rounding: the tolerance is 1e-4.",
+    ),
+    "order-of-rules-ignored": (
+        _readings(_in_the_usual_order),
+        "The answers are in an order of their own: entry k belongs to rules[k].",
+    ),
+    "says-which-not": (after(ch44.which_gae, torch.logical_not), "True where a rule fits; this is True where it does not."),
+}
+
+_SOME = ("dropped", "leak", "textbook")
+
+WHICH_GAE = Exercise(
+    name="which_gae",
+    reference=ch44.which_gae,
+    criteria={"values": 0.9, "inputs": 0.05, "errors": 0.05},
+    axes=("rule",),
+    cases=(
+        *(
+            Case(
+                f"what {_RECORDED[rule][1]} computed",
+                _logged_in_the_atlas(rule),
+                closed_form=_only(rule),
+                visible=True,
+                draws=1,
+            )
+            for rule in RULES
+        ),
+        *(
+            Case(f"“{rule}”, from a log", _logged(rule, _wild_ends), closed_form=_only(rule), visible=rule == "leak")
+            for rule in RULES
+        ),
+        Case(
+            "no episode ends: most rules agree",
+            _logged("leak", _wild_rollout()),
+            closed_form=_only("textbook", "termination", "leak", "current_value"),
+            visible=True,
+        ),
+        Case(
+            "a task that ended: most rules agree",
+            _logged("termination", _wild_end("terminated")),
+            closed_form=_only("textbook", "termination", "leak", "current_value"),
+        ),
+        Case(
+            "the time limit is in the second environment",
+            _logged("leak", _two_envs_apart),
+            closed_form=_only("leak"),
+            visible=True,
+        ),
+        Case("large rewards", _logged("current_value", _wild_ends, scale=1e4), closed_form=_only("current_value"), visible=True),
+        Case("rounding at every step", _logged("dropped", noise=5e-5), closed_form=_only("dropped"), visible=True),
+        Case("three rules, in another order", _logged("leak", rules=_SOME), closed_form=_only("leak", of=_SOME), visible=True),
+        Case("one entry is 0.01 too large", _logged("leak", _wild_ends, off=0.01), closed_form=_only(), visible=True),
+        Case("one entry is 0.002 too small", _logged("textbook", _wild_ends, off=-0.002), closed_form=_only(), visible=True),
+        Case("all entries are 0.01 off", _logged("termination", _wild_ends, noise=0.01), closed_form=_only(), visible=True),
+        Case("one entry is far too small", _logged("textbook", _wild_rollout(), off=-9.0), closed_form=_only(), visible=True),
+        Case("the last entry is too large", _logged("textbook", off=0.5, at=(7, 2)), closed_form=_only()),
+        Case("inputs that require gradient", _logged("leak"), differentiate=("logged", *_WILD), visible=True, draws=1),
+        Case("single precision", _logged("dropped", _wild_ends), dtype=torch.float32, visible=True),
+        Case(
+            "rules = leak, truncation",
+            replaced(_logged("leak"), rules=["leak", "truncation"]),
+            raises=["rule"],  # as gae_as has it
+            visible=True,
+            draws=1,
+        ),
+        refused(_logged("leak"), gamma=1.5),
+        Case(
+            "logged with a column too few",
+            reshaped(_logged("leak"), "logged", lambda x: x[:, :1]),
+            raises=("logged", *ROLLOUT),
+            visible=True,
+            draws=1,
+        ),
+    ),
+    misconceptions=(
+        *wrong(_WRONG_READINGS),
+        bad_input_accepted(_which(_fits, checked=False)),
+        in_place(ch44.which_gae, "logged"),
+    ),
+    variants={
+        "torch.isclose": _which(
+            lambda logged, computed: torch.isclose(computed, logged, rtol=0, atol=1e-4 * _scale(logged).item()).all()
+        ),
+        "entry by entry": _readings(_entry_by_entry),
+        "all rules at once": _readings(_all_at_once),
+        "in double precision": _which(lambda logged, computed: _fits(logged.double(), computed.double())),
+    },
+)
+
 # ------------------------------------------------------------------------------------------------------ repaired_targets
 
 
@@ -849,7 +1440,7 @@ _WRONG_TARGETS = {
     "outputs-swapped": (after(ch44.repaired_targets, _swapped), "The order is (advantages, returns)."),
     "truncated-treated-as-terminated": (
         _targets(_gae(no_bootstrap=_at_either)),
-        "A time limit does not end the task: bootstrap from next_values there.",
+        "A time limit does not end the task: bootstrap from next_values there." + wild.also("truncation_as_end", "gae"),
     ),
     "recursion-never-stops": (
         _targets(_gae(stop=_never)),
@@ -887,4 +1478,13 @@ REPAIRED_TARGETS = Exercise(
     },
 )
 
-EXERCISES = (TD_RESIDUALS, COMPUTE_GAE, LAMBDA_RETURNS, NORMALIZE_ADVANTAGES, EXPLAINED_VARIANCE, REPAIRED_TARGETS)
+EXERCISES = (
+    TD_RESIDUALS,
+    COMPUTE_GAE,
+    LAMBDA_RETURNS,
+    NORMALIZE_ADVANTAGES,
+    EXPLAINED_VARIANCE,
+    GAE_AS,
+    WHICH_GAE,
+    REPAIRED_TARGETS,
+)

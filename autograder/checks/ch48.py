@@ -9,6 +9,7 @@ import torch
 from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
 from torch.nn import functional as F
 
+from autograder.authoring import wild
 from autograder.authoring.parts import (
     CUT,
     after,
@@ -515,7 +516,8 @@ _WRONG_TEMPERATURE_LOSS = {
     ),
     "log-alpha-taken-as-alpha": (
         lambda log_alpha, lp, target: -(log_alpha * (lp.detach() + target)).mean(),
-        "α is exp(log_alpha). The loss with log α in place of α has another value and another gradient.",
+        "α is exp(log_alpha). The loss with log α in place of α has another value and another gradient."
+        + wild.also("log_alpha", "temperature_loss"),
     ),
     "target-subtracted": (
         lambda log_alpha, lp, target: -(log_alpha.exp() * (lp.detach() - target)).mean(),

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from autograder.authoring import wild
 from autograder.authoring.parts import (
     IN_PLACE,
     altered,
@@ -604,7 +605,8 @@ _WRONG_MOMENTS = {
     ),
     "row-by-row": (
         lambda x, m: (_of_rows(torch.mean, x, m), _of_rows(_std, x, m)),
-        "Each row is whitened by itself, which erases the differences between texts: take statistics over the batch.",
+        "Each row is whitened by itself, which erases the differences between texts: take statistics over the batch."
+        + wild.also("by_row", "whitened"),
     ),
     "not-centred": (lambda x, m: (0, _std(x[m])), "Subtract the mean of the kept entries as well."),
     "only-centred": (lambda x, m: (x[m].mean(), 1), "Divide by the standard deviation of the kept entries as well."),
@@ -920,7 +922,10 @@ def _excess(r, a, e):
 
 
 _WRONG_PPO_TOKEN_LOSS = {
-    "mean-of-row-means": (_loss(mean=lambda terms, m: (_zeroed(terms, m).sum(1) / m.sum(1)).mean()), _ROW_MEANS),
+    "mean-of-row-means": (
+        _loss(mean=lambda terms, m: (_zeroed(terms, m).sum(1) / m.sum(1)).mean()),
+        _ROW_MEANS + wild.also("row_means", "token_policy_loss"),
+    ),
     "divided-by-everything": (
         _loss(mean=lambda terms, m: _zeroed(terms, m).mean()),
         "The sum is over kept tokens, and so is the count: here it is divided by the size of the whole batch with its padding.",

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from autograder.authoring import wild
 from autograder.authoring.parts import (
     altered,
     bad_input_accepted,
@@ -337,7 +338,8 @@ _WRONG_DPO_LOSS = {
     ),
     "smoothing-ignored": (
         _dpo(lambda gap, b, s: _smoothed(b * gap, 0)),
-        "label_smoothing is not used: with weight s the label is taken to be the other way round.",
+        "label_smoothing is not used: with weight s the label is taken to be the other way round."
+        + wild.also("ignored", "dpo_loss_smoothed_mean"),
     ),
     "smoothing-subtracted": (
         _dpo(lambda gap, b, s: (1 - s) * F.softplus(-b * gap) - s * F.softplus(b * gap)),

@@ -16,6 +16,7 @@ from autograder.paths import checkout
 
 FOLDERS = {"autograder": "*.py", "solutions": "*.py", "experiments": "*.py", "course_lib": "*", "chapters": "*.md"}
 FILES = ("requirements.txt", "constraints.txt", "pyproject.toml", "README.md", "book/references.bib")
+ATLAS = "experiments/atlas/records"  # checks say whose rule an answer follows
 _DATE = (1980, 1, 1, 0, 0, 0)  # the same bytes for the same course
 
 _SETUP = """\
@@ -63,6 +64,7 @@ def _sources(root: Path) -> Iterator[Path]:
             if path.is_file() and not path.is_symlink() and not {"__pycache__", "frozen"} & set(inside):
                 yield path
     yield from (root / name for name in FILES if (root / name).is_file())
+    yield from (root / ATLAS).glob("*.json")
 
 
 def _add(target: zipfile.ZipFile, name: str, data: bytes, mode: int) -> None:

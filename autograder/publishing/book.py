@@ -181,9 +181,9 @@ def _kept(name: str, key: str, make: Callable[[], tuple[dict[str, bytes], bool]]
 def _stage_keys(chapters: list[Chapter], with_solutions: bool) -> dict[str, str]:
     """Of each chapter, of the kill matrix, of what pages can judge, of what they are handed for it, and of the front page's figure, a
     hash of all that its part of the stage rests on: for a chapter its own text and outputs, the names of pages and exercises in all
-    others, and all code, as references and checks may take anything from it."""
+    others, and all code and the atlas, as references and checks may take anything from them."""
     code = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
-    common = content_hash((), [*code, BIBLIOGRAPHY, ROOT / "requirements.txt", ROOT / "constraints.txt"])
+    common = content_hash((), [*code, BIBLIOGRAPHY, ROOT / "requirements.txt", ROOT / "constraints.txt", *atlas_records()])
     names = [f"{chapter.page} {[cell.exercise for cell in chapter.exercises]}" for chapter in chapters]
     keys = {
         chapter.assignment: content_hash([common, str(with_solutions), *names], [chapter.path, cached(chapter)])
