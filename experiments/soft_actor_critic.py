@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from course_lib.control.networks import Adam, Networks
 from experiments.campaign import Report, Result
 from experiments.control import EPISODES, EVALUATION_SEED, evaluate
 from experiments.sensitivity import SAC as REFERENCE
-from solutions import ch48
+from solutions import ch47
 
 ENVIRONMENT, EVERY = "Pendulum-v1", 250  # environment steps between evaluations
 STEPS, JUDGED = 200, 100  # of an episode, and how many of its actions are judged: later ones have too little future left
@@ -44,6 +44,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "buffer_500": {"buffer_size": 500},
     "ratio_5": {"updates": 5},
     "redq_5": {"updates": 5, "asked": "mean of ten"},
+    "lab_suspect": {"follow": "by masks"},
 }
 OURS = {"asked": "smaller of two", "adapts": True, "updates": 1}  # what SACSettings does not have
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -51,7 +52,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     for variant, changes in CHANGES.items()
 }
 SEEDS = {variant: 5 if "updates" in changes else 10 for variant, changes in CHANGES.items()}
-TAUGHT = sac.Taught.of(vars(ch48))
+TAUGHT = sac.Taught.of(vars(ch47))
 
 
 def first_alone() -> sac.Taught:
@@ -64,6 +65,17 @@ def first_alone() -> sac.Taught:
         return TAUGHT.sac_actor_loss(q1, q1, log_probs, alpha)
 
     return replace(TAUGHT, soft_q_target=target, sac_actor_loss=actor_loss)
+
+
+def by_masks(first: torch.Tensor) -> sac.Taught:
+    """The functions of the chapter, but for the bug lab's way to let the slow copies follow; `first` are the first critic's weights."""
+
+    def follow(targets, online, tau):
+        for target, ours in zip(targets, online, strict=True):
+            TAUGHT.polyak_update([target[first]], [ours[first]], tau)
+            TAUGHT.polyak_update([target[~first]], [ours[~first]], tau / 2)
+
+    return replace(TAUGHT, polyak_update=follow)
 
 
 def all_values(critics: Networks, obs, actions, learn=True) -> torch.Tensor:
@@ -124,7 +136,7 @@ class REDQ(Several):
 
     def __init__(self, env, settings, seed, taught):
         super().__init__(env, settings, seed, taught)
-        self.agent = Ensemble(*env.observation_space.shape, env.action_space.low, env.action_space.high, settings, seed)
+        self.agent = Ensemble(len(self.obs), env.action_space.low, env.action_space.high, settings, seed)
 
     def learn(self):
         for _ in range(self.updates):
@@ -135,8 +147,9 @@ class REDQ(Several):
 
 def made(variant: str, seed: int) -> tuple[sac.Training, Callable]:
     """A variant's training, and what its policy is told of the values of several critics, (critics, B) -> (B,)."""
-    changes = OURS | CHANGES[variant]
-    settings = REFERENCE.but(**{name: value for name, value in CHANGES[variant].items() if name not in OURS})
+    changes: dict[str, Any] = OURS | CHANGES[variant]
+    chosen = {field.name for field in fields(REFERENCE)}
+    settings = REFERENCE.but(**{name: value for name, value in CHANGES[variant].items() if name in chosen})
     env = gym.make(ENVIRONMENT)
     if changes["asked"] == "mean of ten":
         return REDQ(env, settings, seed, TAUGHT), lambda q: q.mean(0)
@@ -145,6 +158,9 @@ def made(variant: str, seed: int) -> tuple[sac.Training, Callable]:
     training = kind(env, settings, seed, first_alone() if alone else TAUGHT)
     if not changes["adapts"]:
         training.agent.temperature_optimizer.learning_rate = 0.0
+    if "follow" in changes:
+        weights = len(training.agent.targets.weights)
+        training.taught = by_masks(torch.arange(weights) < weights // 2)
     return training, (lambda q: q[0]) if alone else (lambda q: q.amin(0))
 
 
