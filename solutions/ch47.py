@@ -226,10 +226,17 @@ def sac_update(agent, batch, next_noise, noise, settings):
     Returns: dictionary of critic_loss, actor_loss, temperature_loss and entropy (the mean of
       -log π(ã|s), nats): 0-dim tensors without a graph, each as it was when it was computed.
     """
-    alpha = agent.log_alpha.detach().exp()
 
+    def drawn(obs, noise):
+        """Actions in (-1, 1) that noise makes, (B, A), and their log-probabilities (B,)."""
+        mean, log_std = agent.distribution(obs)
+        pre_tanh_actions = mean + log_std.exp() * noise
+        log_probs = squashed_gaussian_log_prob(mean, log_std, pre_tanh_actions)
+        return pre_tanh_actions.tanh(), log_probs
+
+    alpha = agent.log_alpha.detach().exp()
     with torch.no_grad():
-        next_actions, next_log_probs = _drawn(agent, batch.next_obs, next_noise)
+        next_actions, next_log_probs = drawn(batch.next_obs, next_noise)
         next_q1, next_q2 = sac.values(agent.targets, batch.next_obs, next_actions)
     targets = soft_q_target(
         batch.rewards,
@@ -244,7 +251,7 @@ def sac_update(agent, batch, next_noise, noise, settings):
     of_critics = critic_loss(q1, q2, targets)
     sac.minimise(of_critics, agent.critics_optimizer)
 
-    actions, log_probs = _drawn(agent, batch.obs, noise)
+    actions, log_probs = drawn(batch.obs, noise)
     q1, q2 = sac.values(agent.critics, batch.obs, actions, learn=False)
     of_actor = sac_actor_loss(q1, q2, log_probs, alpha)
     sac.minimise(of_actor, agent.actor_optimizer)
@@ -259,18 +266,6 @@ def sac_update(agent, batch, next_noise, noise, settings):
         "temperature_loss": of_temperature.detach(),
         "entropy": -log_probs.detach().mean(),
     }
-
-
-def _drawn(agent, obs, noise):
-    """Actions in (-1, 1), (B, A), made of the policy's outputs and noise, and their
-    log-probabilities (B,).
-    """
-    mean, log_std = agent.distribution(obs)
-    pre_tanh_actions = mean + log_std.exp() * noise
-    return (
-        pre_tanh_actions.tanh(),
-        squashed_gaussian_log_prob(mean, log_std, pre_tanh_actions),
-    )
 
 
 def repaired_follow(target_weights, online_weights, first, tau):

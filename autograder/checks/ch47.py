@@ -1103,21 +1103,22 @@ def _targets(agent, batch, next_noise, alpha, gamma, networks=None, obs=None, ju
     with torch.no_grad():
         at = batch.next_obs if obs is None else obs
         actions, log_probs = _acting(agent, at, next_noise)
-        q = sac.values(networks or agent.targets, at if judged is None else judged, actions)
-    return ch47.soft_q_target(batch.rewards, batch.terminated, *q, log_probs, alpha, gamma)
+        q1, q2 = sac.values(networks or agent.targets, at if judged is None else judged, actions)
+    return ch47.soft_q_target(batch.rewards, batch.terminated, q1, q2, log_probs, alpha, gamma)
 
 
 def _step_of_critics(agent, batch, targets):
-    loss = ch47.critic_loss(*sac.values(agent.critics, batch.obs, batch.actions), targets)
+    q1, q2 = sac.values(agent.critics, batch.obs, batch.actions)
+    loss = ch47.critic_loss(q1, q2, targets)
     sac.minimise(loss, agent.critics_optimizer)
     return loss.detach()
 
 
 def _step_of_policy(agent, obs, noise, alpha, networks=None, gradient=True):
-    """The policy's loss and the log-probabilities of its actions; with a step, unless `gradient` is None."""
+    """A step of the policy; its loss and the log-probabilities of its actions. `gradient` says whether any passes through the actions."""
     actions, log_probs = _acting(agent, obs, noise)
-    q = sac.values(networks or agent.critics, obs, actions if gradient else actions.detach(), learn=False)
-    loss = ch47.sac_actor_loss(*q, log_probs, alpha)
+    q1, q2 = sac.values(networks or agent.critics, obs, actions if gradient else actions.detach(), learn=False)
+    loss = ch47.sac_actor_loss(q1, q2, log_probs, alpha)
     sac.minimise(loss, agent.actor_optimizer)
     return loss.detach(), log_probs.detach()
 
@@ -1175,7 +1176,8 @@ def _updating(
 def _leaking(agent, obs, noise, alpha):
     """One backward pass for both: the critics are moved by the policy's loss."""
     actions, log_probs = _acting(agent, obs, noise)
-    loss = ch47.sac_actor_loss(*sac.values(agent.critics, obs, actions), log_probs, alpha)
+    q1, q2 = sac.values(agent.critics, obs, actions)
+    loss = ch47.sac_actor_loss(q1, q2, log_probs, alpha)
     sac.minimise(loss, agent.actor_optimizer, agent.critics_optimizer)
     return loss.detach(), log_probs.detach()
 
@@ -1183,7 +1185,8 @@ def _leaking(agent, obs, noise, alpha):
 def _climbing(agent, obs, noise, alpha):
     """The policy's step, upside down."""
     actions, log_probs = _acting(agent, obs, noise)
-    loss = ch47.sac_actor_loss(*sac.values(agent.critics, obs, actions, learn=False), log_probs, alpha)
+    q1, q2 = sac.values(agent.critics, obs, actions, learn=False)
+    loss = ch47.sac_actor_loss(q1, q2, log_probs, alpha)
     sac.minimise(-loss, agent.actor_optimizer)
     return loss.detach(), log_probs.detach()
 
@@ -1191,7 +1194,8 @@ def _climbing(agent, obs, noise, alpha):
 def _unmoved(agent, obs, noise, alpha):
     """The policy's loss, and no step."""
     actions, log_probs = _acting(agent, obs, noise)
-    return ch47.sac_actor_loss(*sac.values(agent.critics, obs, actions), log_probs, alpha).detach(), log_probs.detach()
+    q1, q2 = sac.values(agent.critics, obs, actions)
+    return ch47.sac_actor_loss(q1, q2, log_probs, alpha).detach(), log_probs.detach()
 
 
 def _of_stored_actions(agent, batch, log_probs):
@@ -1233,14 +1237,12 @@ def _together(agent, batch, next_noise, noise, settings):
     alpha = agent.log_alpha.detach().exp()
     of_critics = _step_of_critics(agent, batch, _targets(agent, batch, next_noise, alpha, settings.gamma))
     actions, log_probs = _acting(agent, batch.obs, noise)
-    q = sac.values(agent.critics, batch.obs, actions, learn=False)
-    losses = (
-        ch47.sac_actor_loss(*q, log_probs, alpha),
-        ch47.temperature_loss(agent.log_alpha, log_probs, agent.target_entropy),
-    )
-    sac.minimise(sum(losses), agent.actor_optimizer, agent.temperature_optimizer)
+    q1, q2 = sac.values(agent.critics, batch.obs, actions, learn=False)
+    of_policy = ch47.sac_actor_loss(q1, q2, log_probs, alpha)
+    of_temperature = ch47.temperature_loss(agent.log_alpha, log_probs, agent.target_entropy)
+    sac.minimise(of_policy + of_temperature, agent.actor_optimizer, agent.temperature_optimizer)
     _follow(agent, settings)
-    return _told(of_critics, *(loss.detach() for loss in losses), log_probs.detach())
+    return _told(of_critics, of_policy.detach(), of_temperature.detach(), log_probs.detach())
 
 
 def _temperature_at_last(agent, batch, next_noise, noise, settings):
@@ -1254,15 +1256,15 @@ def _temperature_at_last(agent, batch, next_noise, noise, settings):
 
 _WRONG_SAC_UPDATE = {
     "target-by-the-critics": (
-        {"targets": lambda agent, *rest: _targets(agent, *rest, networks=agent.critics)},
+        {"targets": lambda agent, batch, noise, alpha, gamma: _targets(agent, batch, noise, alpha, gamma, agent.critics)},
         "The target is made by the critics themselves: the slow copies, agent.targets, make it.",
     ),
     "target-in-the-state-before": (
-        {"targets": lambda agent, batch, *rest: _targets(agent, batch, *rest, obs=batch.obs)},
+        {"targets": lambda agent, batch, noise, alpha, gamma: _targets(agent, batch, noise, alpha, gamma, obs=batch.obs)},
         "The target's action is drawn in obs: what follows the step is worth what next_obs is, and the action is the policy's there.",
     ),
     "next-action-judged-in-the-state-before": (
-        {"targets": lambda agent, batch, *rest: _targets(agent, batch, *rest, judged=batch.obs)},
+        {"targets": lambda agent, batch, noise, alpha, gamma: _targets(agent, batch, noise, alpha, gamma, judged=batch.obs)},
         "The action drawn for next_obs is judged in obs: both belong to the next state.",
     ),
     "noises-swapped": (
@@ -1294,11 +1296,11 @@ _WRONG_SAC_UPDATE = {
     "policy-climbs-its-loss": ({"policy": _climbing}, "The policy's loss is increased: minimise takes the loss as it is."),
     "policy-stands-still": ({"policy": _unmoved}, "The policy does not move: its loss is computed, and never minimised."),
     "action-detached": (
-        {"policy": lambda *given: _step_of_policy(*given, gradient=None)},
+        {"policy": lambda agent, obs, noise, alpha: _step_of_policy(agent, obs, noise, alpha, gradient=False)},
         "The policy's action is cut from the graph before the critics see it: no reward reaches the policy.",
     ),
     "policy-judged-by-the-copies": (
-        {"policy": lambda agent, *rest: _step_of_policy(agent, *rest, networks=agent.targets)},
+        {"policy": lambda agent, obs, noise, alpha: _step_of_policy(agent, obs, noise, alpha, agent.targets)},
         "The slow copies judge the policy's actions: the critics do, as they have just become. The copies are for targets.",
     ),
     "policy-in-the-next-state": (
@@ -1340,20 +1342,29 @@ _WRONG_SAC_UPDATE = {
     ),
 }
 
-_AFTER = {"returns": ("agent",), "rtol": 1e-3, "atol": 1e-4}
+
+def _afterwards(name, inputs, **options):
+    """A case that looks at the agent after the update."""
+    return Case(name, inputs, returns=("agent",), rtol=1e-3, atol=1e-4, **options)
+
+
+def _reported(name, inputs, **options):
+    """A case that looks at what the update tells."""
+    return Case(name, inputs, rtol=1e-4, atol=1e-4, **options)
+
 
 SAC_UPDATE = Exercise(
     name="sac_update",
     reference=ch47.sac_update,
     criteria={"values": 3.0},
     cases=drawn_once(
-        Case("the agent afterwards", _one_update(), visible=True, draws=2, **_AFTER),
-        Case("what is reported", _one_update(), visible=True, draws=2, rtol=1e-4, atol=1e-4),
-        Case("a high temperature", _one_update(alpha=3.0, target_entropy=0.3), **_AFTER),
-        Case("what is reported, at a high temperature", _one_update(alpha=3.0, target_entropy=0.3), rtol=1e-4, atol=1e-4),
-        Case("one action, no step ends, tau = 1", _one_update(actions=1, ended=0.0, tau=1.0), visible=True, **_AFTER),
-        Case("learning rate 0: the copies alone move", _one_update(learning_rate=0.0, tau=0.5), visible=True, **_AFTER),
-        Case("every step ends", _one_update(ended=1.1), rtol=1e-4, atol=1e-4),
+        _afterwards("the agent afterwards", _one_update(), visible=True, draws=2),
+        _reported("what is reported", _one_update(), visible=True, draws=2),
+        _afterwards("a high temperature", _one_update(alpha=3.0, target_entropy=0.3)),
+        _reported("what is reported, at a high temperature", _one_update(alpha=3.0, target_entropy=0.3)),
+        _afterwards("one action, no step ends, tau = 1", _one_update(actions=1, ended=0.0, tau=1.0), visible=True),
+        _afterwards("learning rate 0: the copies alone move", _one_update(learning_rate=0.0, tau=0.5), visible=True),
+        _reported("every step ends", _one_update(ended=1.1)),
     ),
     misconceptions=wrong(_WRONG_SAC_UPDATE, lambda parts: _updating(**parts)),
     variants={
@@ -1370,7 +1381,7 @@ _WEIGHTS = ("target_weights", "online_weights", "first")
 
 
 @drawing
-def _copies(generator, size=8, tau=0.2, parameter=False, pattern=None):
+def _copies(generator, size=8, tau=0.2, pattern=None):
     """Weights of which about half, in no order, are the first critic's."""
     first = uniform(generator, size) < 0.5 if pattern is None else torch.full((size,), pattern)
     if pattern is None:
@@ -1390,6 +1401,10 @@ def _following(move, checked=True):
             move(target_weights, online_weights, first, tau)
 
     return _followed(version, checked)
+
+
+def _followed_by(name, inputs, **options):
+    return Case(name, inputs, returns=("target_weights",), **options)
 
 
 def _share(first, tau, target):
@@ -1462,18 +1477,13 @@ REPAIRED_FOLLOW = Exercise(
     criteria={"values": 1.5, "dtype": 0.1, "inputs": 0.2, "errors": 0.2},
     axes=("weight",),
     cases=drawn_once(
-        *(
-            Case(name, inputs, returns=("target_weights",), **options)
-            for name, inputs, options in (
-                ("eight weights in no order", _copies(), {"visible": True, "draws": 2}),
-                ("tau = 0.005", _copies(tau=0.005), {}),
-                ("tau = 1: the first is copied", _copies(tau=1.0), {"visible": True}),
-                ("tau = 0: nothing moves", _copies(tau=0.0), {"visible": True}),
-                ("all weights are the first critic's", _copies(pattern=True), {}),
-                ("none is", _copies(pattern=False), {}),
-                ("single precision", _copies(), {"dtype": torch.float32, "visible": True}),
-            )
-        ),
+        _followed_by("eight weights in no order", _copies(), visible=True, draws=2),
+        _followed_by("tau = 0.005", _copies(tau=0.005)),
+        _followed_by("tau = 1: the first is copied", _copies(tau=1.0), visible=True),
+        _followed_by("tau = 0: nothing moves", _copies(tau=0.0), visible=True),
+        _followed_by("all weights are the first critic's", _copies(pattern=True)),
+        _followed_by("none is", _copies(pattern=False)),
+        _followed_by("single precision", _copies(), dtype=torch.float32, visible=True),
         *shape_cases(_copies(), _WEIGHTS),
         refused(_copies(), tau=1.5, visible=True),
         refused(_copies(), tau=-0.1),

@@ -1,4 +1,4 @@
-"""Chapter 48's functions: values by hand, limits, gradients, and the fast update against the plain one."""
+"""Chapter 48's functions: values by hand, limits, and the fast update against the plain one."""
 
 import gymnasium as gym
 import pytest
@@ -9,11 +9,7 @@ from hypothesis import strategies as st
 from course_lib.control import sac
 from course_lib.control.replay import Transitions
 from solutions import ch47
-from solutions.ch48 import (
-    bootstrap_interval,
-    fast_sac_update,
-    interquartile_mean,
-)
+from solutions.ch48 import bootstrap_interval, fast_sac_update, interquartile_mean
 
 TAUGHT = sac.Taught.of(vars(ch47))
 SMALL = sac.SACSettings(total_steps=300, learning_starts=50, batch_size=16, hidden=8)
