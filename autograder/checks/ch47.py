@@ -1446,11 +1446,11 @@ _WRONG_FOLLOW = {
         "The first critic's copy follows by half of tau, and the second's by tau: it is the other way round.",
     ),
     "first-only": (
-        lambda target, online, first, tau: target.lerp_(online, first * tau),
+        lambda target, online, first, tau: target.lerp_(online, torch.where(first, tau, 0.0).to(target.dtype)),
         "The second critic's copy does not move: it follows by half of tau.",
     ),
     "second-only": (
-        lambda target, online, first, tau: target.lerp_(online, ~first * (0.5 * tau)),
+        lambda target, online, first, tau: target.lerp_(online, torch.where(first, 0.0, 0.5 * tau).to(target.dtype)),
         "The first critic's copy does not move: it follows by tau.",
     ),
     "copied": (
