@@ -22,3 +22,8 @@ def seed_everything(seed: int) -> torch.Generator:
 def generator(seed: int) -> torch.Generator:
     """A torch generator of its own, for explicit draws."""
     return torch.Generator().manual_seed(seed)
+
+
+def noise(rows: int, columns: int, seed: int) -> torch.Tensor:
+    """Standard normal numbers, (rows, columns) float32, the same for the same seed."""
+    return torch.randn(rows, columns, generator=generator(seed))

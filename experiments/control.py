@@ -28,7 +28,7 @@ from course_lib.control.rollouts import EpisodeReturns
 from course_lib.control.sac import SACSettings
 from experiments import checkpoint, snapshots
 from experiments.campaign import Report, Result
-from solutions import ch45, ch48
+from solutions import ch45, ch47, ch48
 
 ENVIRONMENTS = {
     "hopper": "Hopper-v5",
@@ -91,7 +91,7 @@ class SACRun:
 
     def __init__(self, place: str, seed: int, settings: SACSettings | None = None):
         self.settings = settings or SAC_SETTINGS[place]
-        taught = sac.Taught.of(vars(ch48))
+        taught = sac.Taught.of(vars(ch47))
         self.training = sac.Training(gym.make(ENVIRONMENTS[place]), self.settings, seed, taught, ch48.fast_sac_update)
         self.best_action = self.training.agent.best_action
 

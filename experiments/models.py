@@ -25,7 +25,7 @@ from course_lib.control.mbpo import MBPOSettings
 from course_lib.figures import videos
 from experiments.campaign import Report, Result
 from experiments.control import ENVIRONMENTS, EPISODES, SACRun, followed
-from solutions import ch48, ch51
+from solutions import ch47, ch48, ch51
 
 PENDULUM = MBPOSettings()
 WALKER2D = MBPOSettings(
@@ -80,7 +80,7 @@ class MBPORun(SACRun):
 
     def __init__(self, variant: str, seed: int):
         self.settings, self.environment = SETTINGS[variant], ENVIRONMENTS[_place(variant)]
-        taught = mbpo.Taught.of(vars(ch51) | vars(ch48))
+        taught = mbpo.Taught.of(vars(ch51) | vars(ch47))
         self.training = mbpo.Training(gym.make(self.environment), self.settings, seed, taught, update=ch48.fast_sac_update)
         self.best_action = self.training.agent.best_action
 

@@ -22,7 +22,7 @@ from course_lib.control.policies import policy_for
 from course_lib.control.ppo import PPOSettings
 from experiments.campaign import Report, Result
 from experiments.control import NUM_ENVS, PPO_SETTINGS, evaluate
-from solutions import ch45, ch48
+from solutions import ch45, ch47, ch48
 
 ENVIRONMENT = "Pendulum-v1"
 SAC = sac.SACSettings(
@@ -104,7 +104,7 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
 
         ch45.train_ppo(world, settings, seed, policy, log=every_other, update=ch45.fast_ppo_update)
     else:
-        training = sac.Training(gym.make(ENVIRONMENT), settings, seed, sac.Taught.of(vars(ch48)), updating(variant))
+        training = sac.Training(gym.make(ENVIRONMENT), settings, seed, sac.Taught.of(vars(ch47)), updating(variant))
         while training.env_steps < settings.total_steps:
             log(training.advance(EVERY["sac"]), training.agent.best_action)
     return Result(rows, {"final_return": rows[-1]["eval_return"]})

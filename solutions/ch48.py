@@ -1,5 +1,5 @@
-"""Reference solutions of chapter 48: soft actor-critic's losses and targets, and the
-statistics of a fair comparison.
+"""Reference solutions of chapter 48: the statistics of a fair comparison, what the bug lab's
+buffer should keep, and a fast update of soft actor-critic.
 """
 
 from __future__ import annotations
@@ -8,135 +8,9 @@ import math
 
 import numpy as np
 import torch
-from torch.nn import functional
 
-from course_lib import validate
 from course_lib.control.replay import Transitions
-
-
-def squashed_gaussian_log_prob(mean, log_std, pre_tanh_actions):
-    """Log-density of actions a = tanh(u) whose pre-activations u are normally distributed.
-
-        log π(a|s) = Σ_i [ log N(u_i; μ_i, σ_i²) - log(1 - tanh² u_i) ],   σ = exp(log_std)
-
-    Haarnoja et al. (2018), appendix C, https://arxiv.org/abs/1801.01290. For large |u|
-    the hyperbolic tangent rounds to ±1, and 1 - tanh² u to 0; its logarithm is to be
-    right there, too.
-
-    Args:
-      mean: μ(s); (B, A). Receives gradient.
-      log_std: log σ(s); (B, A). Receives gradient.
-      pre_tanh_actions: u, before squashing; (B, A). Receives gradient: in SAC u is
-        μ + σ ε, and the policy learns through it.
-
-    Returns: (B,) nats, summed over the components.
-    Raises: ValueError that names an argument if the shapes differ.
-    """
-    validate.same_shape(mean=mean, log_std=log_std, pre_tanh_actions=pre_tanh_actions)
-    scaled = (pre_tanh_actions - mean) * (-log_std).exp()
-    normal = -0.5 * scaled.square() - log_std - 0.5 * math.log(2 * math.pi)
-    # 1 - tanh² u = 4 / (e^u + e^-u)², and log(e^u + e^-u) = u + log(1 + e^-2u)
-    log_slope = 2 * (
-        math.log(2) - pre_tanh_actions - functional.softplus(-2 * pre_tanh_actions)
-    )
-    return (normal - log_slope).sum(-1)
-
-
-def soft_q_target(rewards, terminated, next_q1, next_q2, next_log_probs, alpha, gamma=0.99):
-    """What both critics should say of a step: its reward, and the soft value of what follows.
-
-        y = r + γ (1 - terminated) [ min(Q₁', Q₂') - α log π(a'|s') ],   a' ~ π(·|s')
-
-    Haarnoja et al. (2018b), section 6, https://arxiv.org/abs/1812.05905
-
-    Args:
-      rewards: (B,).
-      terminated: whether the task ended with the step; (B,) bool. A step that a time
-        limit cut off has not terminated.
-      next_q1, next_q2: the target critics' values of the next state and a fresh action
-        there, in units of reward; (B,).
-      next_log_probs: log-probability of that action, in nats; (B,).
-      alpha: α ≥ 0, the temperature, in units of reward per nat; a number or a 0-dim
-        tensor.
-      gamma: γ, in [0, 1].
-
-    Returns: (B,), without a graph.
-    Raises: ValueError that names an argument if the shapes differ or gamma is outside [0, 1].
-    """
-    validate.same_shape(
-        rewards=rewards,
-        terminated=terminated,
-        next_q1=next_q1,
-        next_q2=next_q2,
-        next_log_probs=next_log_probs,
-    )
-    validate.unit_interval(gamma=gamma)
-    with torch.no_grad():
-        soft_values = torch.minimum(next_q1, next_q2) - alpha * next_log_probs
-        return rewards + gamma * torch.where(terminated, 0, soft_values)
-
-
-def sac_actor_loss(q1, q2, log_probs, alpha):
-    """The policy's loss: minus the value of its actions, and minus its entropy's worth.
-
-        L = mean(α log π(a|s) - min(Q₁, Q₂)),   a = tanh(μ(s) + σ(s) ε)
-
-    Haarnoja et al. (2018b), sections 4.2 and 6, https://arxiv.org/abs/1812.05905
-
-    Args:
-      q1, q2: the critics' values of the policy's own actions, in units of reward; (B,).
-        Receive gradient, and pass it on to the actions.
-      log_probs: log-probabilities of those actions, in nats; (B,). Receives gradient.
-      alpha: α ≥ 0, the temperature, in units of reward per nat; a number or a 0-dim
-        tensor. No gradient.
-
-    Returns: scalar tensor.
-    Raises: ValueError that names an argument if the shapes differ.
-    """
-    validate.same_shape(q1=q1, q2=q2, log_probs=log_probs)
-    alpha = torch.as_tensor(alpha).detach()
-    return (alpha * log_probs - torch.minimum(q1, q2)).mean()
-
-
-def temperature_loss(log_alpha, log_probs, target_entropy):
-    """The temperature's loss: descending it raises alpha while the entropy is below the
-    target.
-
-        L = -mean(exp(log α) (log π(a|s) + H̄))
-
-    Haarnoja et al. (2018b), section 5, https://arxiv.org/abs/1812.05905
-
-    Args:
-      log_alpha: log α; (). Receives gradient.
-      log_probs: log-probabilities of the policy's own actions, in nats; (B,). No gradient.
-      target_entropy: H̄, in nats; a number.
-
-    Returns: scalar tensor.
-    """
-    return -(log_alpha.exp() * (log_probs.detach() + target_entropy)).mean()
-
-
-def polyak_update(target_params, online_params, tau):
-    """Move slow copies of parameters a little towards the parameters, in place.
-
-        target ← (1 - τ) target + τ online
-
-    Lillicrap et al. (2016), algorithm 1, https://arxiv.org/abs/1509.02971
-
-    Args:
-      target_params: iterable of tensors, changed in place; they may require gradient.
-      online_params: as many tensors of the same shapes, left as they are.
-      tau: τ in [0, 1]: 0 leaves the targets where they are, 1 copies.
-
-    Returns: None. No graph is made.
-    Raises: ValueError that names an argument if a tensor's shape differs from its partner's,
-      or tau is outside [0, 1].
-    """
-    validate.unit_interval(tau=tau)
-    with torch.no_grad():
-        for target, online in zip(target_params, online_params, strict=True):
-            validate.same_shape(target_params=target, online_params=online)
-            target.lerp_(online, tau)
+from solutions.ch47 import polyak_update
 
 
 def interquartile_mean(scores):

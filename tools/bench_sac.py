@@ -1,4 +1,4 @@
-"""How fast chapter 48's SAC is beside Stable-Baselines3's, at equal arithmetic, one thread each, back to back.
+"""How fast SAC, of chapters 47 and 48, is beside Stable-Baselines3's, at equal arithmetic, one thread each, back to back.
 
     python tools/bench_sac.py [--rounds N] [--steps N] [--record FILE.json]
 
@@ -26,7 +26,7 @@ from rich.table import Table
 from stable_baselines3 import SAC
 
 from course_lib.control import sac
-from solutions import ch48
+from solutions import ch47, ch48
 
 ENVIRONMENT, WARM_UP = "Hopper-v5", 1_000
 
@@ -42,8 +42,8 @@ def stable_baselines(steps):
 
 
 def ours(update, steps):
-    """Rounds of chapter 48 with one of its two updates: yields the milliseconds of a step."""
-    settings, taught = sac.SACSettings(learning_starts=WARM_UP), sac.Taught.of(vars(ch48))
+    """Rounds of SAC with one of its two updates: yields the milliseconds of a step."""
+    settings, taught = sac.SACSettings(learning_starts=WARM_UP), sac.Taught.of(vars(ch47))
     training = sac.Training(gym.make(ENVIRONMENT), settings, 0, taught, update)
     training.advance(WARM_UP + 50)
     while True:

@@ -1,6 +1,6 @@
 """Model-based policy optimisation: soft actor-critic that lives mostly in short dreams of a learned model (chapter 51).
 
-    taught = Taught.of(globals())                       # your functions of chapters 51 and 48
+    taught = Taught.of(globals())                       # your functions of chapters 51 and 47
     training = Training(gym.make("Pendulum-v1"), MBPOSettings(), seed=0, taught=taught)
     for row in training.rows(every=200):
         print(row["env_steps"], row["mean_return"])
@@ -26,7 +26,7 @@ from course_lib.control.replay import ReplayBuffer, Transitions
 
 @dataclass(frozen=True)
 class Taught:
-    """The functions that chapter 51 asks for, under their names there, and those of chapter 48."""
+    """The functions that chapter 51 asks for, under their names there, and those of chapter 47."""
 
     gaussian_nll: Callable
     imagine: Callable
@@ -34,7 +34,7 @@ class Taught:
 
     @classmethod
     def of(cls, namespace: Mapping[str, Any]) -> Taught:
-        """Each function from a namespace; those of chapter 48 from your notebook of it if they are not there."""
+        """Each function from a namespace; those of chapter 47 from your notebook of it if they are not there."""
         return cls(namespace["gaussian_nll"], namespace["imagine"], sac.Taught.of(namespace))
 
 
@@ -216,7 +216,7 @@ class Training(sac.Training):
       env: a Gymnasium environment with flat observations and bounded continuous actions.
       settings: MBPOSettings.
       seed: of the environment, the weights and all that is drawn: two runs with one seed are equal bit for bit.
-      taught: the functions of chapters 51 and 48.
+      taught: the functions of chapters 51 and 47.
       ended: which next_obs end an episode; by default that of `ENDED` for this environment.
       update: of the agent, in place of `sac.update`.
     """

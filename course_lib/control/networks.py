@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -21,6 +22,7 @@ Layers = list[tuple[np.ndarray, np.ndarray]]
 """Of one network, for each layer: weight (in, out) and bias (out,)."""
 
 
+@dataclass(init=False, eq=False, repr=False)
 class Networks:
     """`copies` networks with rectifiers between their layers, float32.
 
@@ -29,6 +31,8 @@ class Networks:
       copies: how many there are; all begin with weights of their own.
       generator: torch generator of the first weights and biases, uniform within ±1 / √(inputs of the layer).
     """
+
+    weights: torch.Tensor  # all that is learnt, and so all that a check of a function that changes networks looks at
 
     def __init__(self, sizes, copies=1, generator=None):
         self.sizes, self.copies = tuple(sizes), copies

@@ -18,6 +18,14 @@ class Transitions(NamedTuple):
     terminated: torch.Tensor  # (B,) bool
 
 
+def made_up(count, obs_dim, action_dim, ended, seed=0) -> Transitions:
+    """Steps that nobody made, float32, for checks of an update; a share `ended` of them terminates, by chance."""
+    generator = torch.Generator().manual_seed(seed)
+    obs, next_obs = torch.randn(2, count, obs_dim, generator=generator)
+    actions, rewards = torch.randn(count, action_dim, generator=generator).tanh(), 2 * torch.randn(count, generator=generator)
+    return Transitions(obs, actions, rewards, next_obs, torch.rand(count, generator=generator) < ended)
+
+
 class ReplayBuffer:
     """The last `capacity` steps, float32.
 

@@ -1,6 +1,6 @@
-"""Soft actor-critic: the agent, and the loop that trains it (chapters 48 and 51).
+"""Soft actor-critic: the agent, and the loop that trains it (chapters 47, 48 and 51).
 
-    taught = Taught.of(globals())                       # your functions of chapter 48
+    taught = Taught.of(globals())                       # your functions of chapter 47
     training = Training(gym.make("Pendulum-v1"), SACSettings(), seed=0, taught=taught)
     for row in training.rows(every=1000):
         print(row["env_steps"], row["mean_return"])
@@ -29,7 +29,7 @@ from course_lib.control.replay import ReplayBuffer, Transitions
 
 @dataclass(frozen=True)
 class Taught:
-    """The functions that chapter 48 asks for, under their names there."""
+    """The functions that chapter 47 asks for, under their names there."""
 
     squashed_gaussian_log_prob: Callable
     soft_q_target: Callable
@@ -39,9 +39,9 @@ class Taught:
 
     @classmethod
     def of(cls, namespace: Mapping[str, Any]) -> Taught:
-        """Each function from a namespace, and from your notebook of chapter 48 where it has none."""
+        """Each function from a namespace, and from your notebook of chapter 47 where it has none."""
         names = [field.name for field in fields(cls)]
-        return cls(**{name: namespace[name] if name in namespace else earlier(name, 48) for name in names})
+        return cls(**{name: namespace[name] if name in namespace else earlier(name, 47) for name in names})
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,17 @@ class SACSettings:
         return replace(self, **changes)
 
 
+@dataclass(init=False, eq=False, repr=False)
 class Agent:
     """A squashed Gaussian policy, twin critics, their slow copies, and a temperature, each with its optimiser.
 
     Inside, actions lie in (-1, 1); `low` and `high`, (A,), are the bounds of what the environment takes.
     """
 
+    actor: Networks
+    critics: Networks
+    targets: Networks
+    log_alpha: torch.Tensor
     log_std_range = (-20.0, 2.0)
 
     def __init__(self, obs_dim, low, high, settings, seed=0):
@@ -134,6 +139,20 @@ class Agent:
         return self.actor_optimizer, self.critics_optimizer, self.temperature_optimizer
 
 
+def begun(obs_dim, low, high, settings, seed=0):
+    """An agent in the midst of its training, for checks of an update: its policy and critics have moved away from where they began.
+
+    Its optimisers' ε is 1, so that a step tells the size of a gradient and not its sign alone.
+    """
+    agent, generator = Agent(obs_dim, low, high, settings, seed), torch.Generator().manual_seed(seed)
+    for networks in (agent.actor, agent.critics):
+        with torch.no_grad():
+            networks.weights.add_(0.3 * torch.randn(networks.weights.shape, generator=generator))
+    for optimizer in agent._optimizers():
+        optimizer.eps = 1.0
+    return agent
+
+
 def values(critics: Networks, obs, actions, learn=True):
     """What two critics say of actions (B, A) in (-1, 1) in states (B, O): (B,) from each."""
     first, second = critics(torch.cat([obs, actions], -1), learn).squeeze(-1)
@@ -185,7 +204,7 @@ class Training:
       env: a Gymnasium environment with flat observations and bounded continuous actions.
       settings: SACSettings.
       seed: of the environment, the weights and all that is drawn: two runs with one seed are equal bit for bit.
-      taught: the functions of chapter 48.
+      taught: the functions of chapter 47.
       update: called in place of `update`, with the same arguments.
     """
 

@@ -17,7 +17,7 @@ import torch
 from torch.nn import functional
 
 from course_lib.control import sac
-from solutions import ch43, ch44, ch45, ch48, ch74, ch80, ch95, ch96, ch97
+from solutions import ch43, ch44, ch45, ch47, ch74, ch80, ch95, ch96, ch97
 
 TOLERANCE = 1e-6
 """Of a difference between two numbers, and of its ratio to the largest number of a row where that is above 1."""
@@ -311,24 +311,24 @@ def _silenced(logp, old_logp, advantages, clip_range):
     return (ratio.clamp(1 - clip_range, 1 + clip_range) * advantages < ratio * advantages).double().mean()
 
 
-# ---- soft actor-critic: chapter 48 ----------------------------------------------------------------------------------
+# ---- soft actor-critic: chapter 47 ----------------------------------------------------------------------------------
 
 
 def _sac(g: SimpleNamespace) -> list[Formula]:
-    target = ch48.soft_q_target(g.sac_rewards, g.sac_terminated, g.q1, g.q2, g.next_logp, g.alpha, g.gamma)
+    target = ch47.soft_q_target(g.sac_rewards, g.sac_terminated, g.q1, g.q2, g.next_logp, g.alpha, g.gamma)
     nothing = torch.zeros_like(g.q1)
     log_alpha = torch.tensor(math.log(g.alpha), dtype=torch.float64)
     alpha = log_alpha.exp()
     both = functional.mse_loss(g.q1, target) + functional.mse_loss(g.q2, target)
     return [
-        _formula("soft_q_target", "Target of SAC's critics", 48, target),
-        _formula("soft_value", "Soft value of the next state", 48,
-                 ch48.soft_q_target(nothing, nothing.bool(), g.q1, g.q2, g.next_logp, g.alpha, 1.0)),
-        _formula("sac_actor_loss", "SAC's actor loss", 48, ch48.sac_actor_loss(g.q1, g.q2, g.next_logp, alpha)),
-        _formula("sac_critic_loss", "SAC's critic loss", 48, _course_critic_loss(g),
+        _formula("soft_q_target", "Target of SAC's critics", 47, target),
+        _formula("soft_value", "Soft value of the next state", 47,
+                 ch47.soft_q_target(nothing, nothing.bool(), g.q1, g.q2, g.next_logp, g.alpha, 1.0)),
+        _formula("sac_actor_loss", "SAC's actor loss", 47, ch47.sac_actor_loss(g.q1, g.q2, g.next_logp, alpha)),
+        _formula("sac_critic_loss", "SAC's critic loss", 47, _course_critic_loss(g),
                  ("half", "Half of the sum of both mean squared errors.", both / 2)),
         _formula(
-            "temperature_loss", "SAC's temperature loss", 48, ch48.temperature_loss(log_alpha, g.next_logp, g.target_entropy),
+            "temperature_loss", "SAC's temperature loss", 47, ch47.temperature_loss(log_alpha, g.next_logp, g.target_entropy),
             ("log_alpha", "log α stands in the place of α; the sign of the gradient is the same, its size is not.",
              -(log_alpha * (g.next_logp + g.target_entropy)).mean()),
         ),
@@ -362,8 +362,8 @@ def _course_critic_loss(g: SimpleNamespace) -> torch.Tensor:
     )
     settings: Any = SimpleNamespace(gamma=g.gamma, tau=0.0)
     taught: Any = SimpleNamespace(
-        soft_q_target=ch48.soft_q_target, sac_actor_loss=ch48.sac_actor_loss, temperature_loss=ch48.temperature_loss,
-        polyak_update=ch48.polyak_update, squashed_gaussian_log_prob=None,
+        soft_q_target=ch47.soft_q_target, sac_actor_loss=ch47.sac_actor_loss, temperature_loss=ch47.temperature_loss,
+        polyak_update=ch47.polyak_update, squashed_gaussian_log_prob=None,
     )  # fmt: skip
     return sac.update(agent, batch, settings, taught, torch.Generator())["critic_loss"]
 

@@ -25,14 +25,14 @@ DRAWN = {
         "What an end of the episode does to credit": ("td_residuals", "compute_gae"),
     },
     "ch45": {"What one action with advantage 1 asks of a Gaussian policy": ("gaussian_log_prob",)},
-    "ch48": {"A Gaussian, squashed, and the correction of its log-density": ("squashed_gaussian_log_prob",)},
+    "ch47": {"A Gaussian, squashed, and the correction of its log-density": ("squashed_gaussian_log_prob",)},
     "ch51": {"What the first λ-return is made of": ("dreamer_lambda_returns",)},
     "ch80": {"A choice, its loss, and how hard it pulls": ("preference_probability", "bradley_terry_loss")},
     "ch97": {"What one pair asks for": ("dpo_loss", "ipo_loss")},
 }
 ELSEWHERE = {
     "ch45": {"Eight epochs on one batch": "course_lib.control.envs.HoverVectorEnv"},
-    "ch48": {"The temperature finds the price at which the policy has the entropy asked for": "torch.optim"},
+    "ch47": {"The temperature finds the price at which the policy has the entropy asked for": "torch.optim"},
     "ch51": {"What an ensemble knows, and what it knows of that": "torch.Generator"},
     "ch95": {"Rewards and advantages of one text": "course_lib.language.lm"},
     "ch96": {"Best-of-n by a proxy: what it promises and what it gives": "torch.Generator"},

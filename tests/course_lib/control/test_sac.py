@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from course_lib.control import sac
-from solutions import ch48
+from solutions import ch47
 
-TAUGHT = sac.Taught.of(vars(ch48))
+TAUGHT = sac.Taught.of(vars(ch47))
 SMALL = sac.SACSettings(total_steps=60, learning_starts=20, batch_size=8, hidden=8)
 
 
@@ -38,7 +38,7 @@ class Corridor(gym.Env):
 def test_functions_come_from_the_namespace_first(monkeypatch):
     monkeypatch.setattr(sac, "earlier", lambda name, chapter: (name, chapter))
     taught = sac.Taught.of({"soft_q_target": len})
-    assert taught.soft_q_target is len and taught.polyak_update == ("polyak_update", 48)
+    assert taught.soft_q_target is len and taught.polyak_update == ("polyak_update", 47)
 
 
 @pytest.mark.parametrize(("terminates", "length"), [(True, 3), (False, 5)])
