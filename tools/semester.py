@@ -6,7 +6,7 @@ Every answer is drawn: the reference, another right answer or a named mistake of
 submission in a hundred is one of tests/attacks. What each must score is known before anything is graded. Then, for each chapter, `course
 collect` and `course grade`; the first with a tolerance mistyped. A dozen open answers get their points in formgrader, in a
 browser; the check is mended and the chapter graded again; `course return` and `nbgrader export` give back. Every score must be as drawn.
-A run that was stopped goes on with the step that it was in. The record says minutes, processor, memory (proportional) and disk.
+A run that was stopped goes on with the step that it was in. The record says minutes, memory (proportional) and disk.
 """
 
 from __future__ import annotations
