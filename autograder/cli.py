@@ -248,6 +248,7 @@ def grade(
 
     from autograder import grade
     from autograder.grading import sandbox
+    from autograder.proving.side_by_side import NoScheduler
 
     left: list[str] = []
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -262,6 +263,9 @@ def grade(
         except (grade.GradingError, sandbox.SandboxUnavailable) as error:
             bar.stop()
             _stop(error)
+        except (NoScheduler, grade.OtherWorker) as error:
+            bar.stop()
+            _stop(f"{error}. What is graded is kept; mend this and grade again.", BROKEN)
         except (OSError, SQLAlchemyError) as error:  # a full disk, most likely; Python's own exit status would mean low scores
             bar.stop()
             _stop(f"the grades cannot be written: {error}. What is written is whole; mend this and grade again.", BROKEN)

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import difflib
 import fcntl
+import functools
+import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator
+import socket
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,6 +28,7 @@ from autograder.authoring import assemble, chapter
 from autograder.grading import deadlines, forking, intake, judge, names, sandbox, sources, verdicts
 from autograder.grading.deadlines import UNKNOWN, Deadlines, HandedIn, Rule
 from autograder.grading.verdicts import Verdict
+from autograder.proving import side_by_side
 
 if TYPE_CHECKING:
     from autograder.reporting.gradebook import Acceptance, GradebookWriter
@@ -66,7 +70,8 @@ def grade(
       left_over: called with a line for each thing in `submitted` that was not understood: what was seen, and what it would take.
 
     Returns: the verdicts of this run, sorted by student and assignment.
-    Raises: GradingError if there is nothing to grade; sandbox.SandboxUnavailable if no sandbox can be had.
+    Raises: GradingError if there is nothing to grade; sandbox.SandboxUnavailable if no sandbox can be had; side_by_side.NoScheduler if
+      there is no scheduler, or none any more; OtherWorker if a worker lacks the files or has other checks.
     """
     tasks = _tasks(submitted, left_over)
     rules = _deadlines(submitted, due)
@@ -149,7 +154,7 @@ def judge_folder(student: str, assignment: str, folder: Path, timeout: float, tr
     return _infra_error(submission, release, failure), submission.notebook
 
 
-def _infra_error(submission: intake.Submission, release: judge.Released, failure: Exception | None) -> Verdict:
+def _infra_error(submission: intake.Submission, release: judge.Released, failure: BaseException | None) -> Verdict:
     total = round(sum(exercise.points for exercise in release.exercises), 4)
     manual = sum(points for _, points in release.open_questions)
     flags = (*submission.flags, f"grader_failed: {type(failure).__name__}: {failure}")
@@ -219,25 +224,52 @@ def _here(tasks: list[Task], jobs: int, timeout: float, trusted: bool) -> Iterat
 
 @contextmanager
 def _on_dask(tasks: list[Task], scheduler: str, timeout: float) -> Iterator[Iterator[Judged]]:
-    """Judge on the workers of a Dask scheduler, which must see the same files."""
-    from distributed import Client, as_completed  # a second of imports that a local run need not pay
+    """Judge on the workers of a Dask scheduler, which must see the same files and have the same course."""
+    handed = [(student, assignment, folder.resolve(), _content(folder)) for student, assignment, folder in tasks]
+    function = functools.partial(_judge_elsewhere, environment=judge.environment(), timeout=timeout)
 
-    with Client(scheduler, timeout="30s") as client:
-        futures = {
-            client.submit(judge_folder, student, assignment, folder.resolve(), timeout, pure=False, retries=1): task
-            for task in tasks
-            for student, assignment, folder in [task]
-        }
+    def judged() -> Generator[Judged]:
+        for one in side_by_side.run(function, handed, scheduler=scheduler):
+            if one.result:
+                yield one.result
+            elif isinstance(one.error, OtherWorker):
+                raise one.error
+            else:  # workers died of it
+                student, assignment, folder, _ = one.item
+                yield _not_judged(student, assignment, folder, one.error)
 
-        def judged() -> Iterator[Judged]:
-            for future in as_completed(futures):
-                if future.status == "finished":
-                    yield future.result()
-                else:  # the worker died, twice
-                    submission = intake.read(*futures[future])
-                    yield _infra_error(submission, judge.released(submission.assignment), future.exception()), None
+    with closing(judged()) as verdicts_of_workers:
+        yield verdicts_of_workers
 
-        yield judged()
+
+class OtherWorker(RuntimeError):
+    """What a worker would say of this submission is worth nothing."""
+
+
+def _judge_elsewhere(task: tuple[str, str, Path, str], environment: str, timeout: float) -> Judged:
+    """Judge, on a worker. One with another file system would find nothing handed in, one with other checks would pay other points."""
+    student, assignment, folder, content = task
+    worker = f"the Dask worker on {socket.gethostname()}"
+    if judge.environment() != environment:
+        raise OtherWorker(f"{worker} has another version of the course: install the same everywhere")
+    if _content(folder) != content:
+        raise OtherWorker(f"{worker} does not see the files in {folder}: it must share this folder")
+    return judge_folder(student, assignment, folder, timeout)
+
+
+def _content(folder: Path) -> str:
+    """The names in a submission's folder, in short; "" if there is none."""
+    try:
+        return hashlib.sha256("\0".join(sorted(os.listdir(folder))).encode(errors="surrogateescape")).hexdigest()
+    except OSError:
+        return ""
+
+
+def _not_judged(student: str, assignment: str, folder: Path, failure: BaseException | None) -> Judged:
+    submission = intake.Submission(student, assignment, folder)
+    if assignment not in judge.assignments():
+        return judge.unknown_assignment(submission), None
+    return _infra_error(submission, judge.released(assignment), failure), None
 
 
 def _write(
