@@ -965,7 +965,7 @@ _ruled = versions_of(ch44.gae_as, _named_rule, one_shape(*ROLLOUT), _last_row, _
 def _gae_as(other="textbook", **changed):
     """A version of the five rules, some of them changed; `other` is the rule that stands in for names that are none."""
     by_rule = _BY_RULE | changed
-    return lambda rule, *given: by_rule.get(rule, by_rule[other])(_Rollout(*given))
+    return lambda rule, *given: by_rule[rule if rule in by_rule else other](_Rollout(*given))
 
 
 def _wild_by_hand(rule, rewards, values, next_values, last_values, terminated, truncated, gamma, gae_lambda):
