@@ -16,7 +16,7 @@ import torch
 
 from course_lib.language import lm, verifiable
 from course_lib.language.rlhf import next_token_loss
-from course_lib.language.verifiable import GroupSettings, Verify, answer, measured, questions
+from course_lib.language.verifiable import GroupSettings, Learner, Verify, answer, measured, questions
 from course_lib.seeding import seed_everything
 from experiments.campaign import Report, Result
 from solutions.ch45 import minibatches
@@ -71,10 +71,9 @@ def started(choice: dict, seed: int) -> lm.LanguageModel:
 def ppo(policy: lm.LanguageModel, seed: int, settings: GroupSettings) -> Callable:
     """An iteration with a critic of the policy's size, as in chapter 95, on as many answers, each to a prompt of its own."""
     torch.manual_seed(seed)
-    critic = lm.ValueModel(policy)
-    its_optimizer = torch.optim.AdamW(critic.parameters(), lr=1e-3, weight_decay=0.0)
+    critic = Learner(lm.ValueModel(policy), 1e-3)
 
-    def iteration(policy, optimizer, prompts, verify, settings, generator):
+    def iteration(policy, prompts, verify, settings, generator):
         samples = policy.generate(prompts, settings.new_tokens, generator=generator)
         ids, attention = samples.input_ids, samples.attention_mask
         scores = verify(prompts, samples.texts)
@@ -83,47 +82,39 @@ def ppo(policy: lm.LanguageModel, seed: int, settings: GroupSettings) -> Callabl
         rewards = scores[:, None] * (columns == torch.where(mask, columns, -1).amax(1, keepdim=True))
         with torch.no_grad():
             old_logps = per_token_logps(policy.logits(ids, attention), ids)
-            values = critic(ids, attention)[:, :-1]
+            values = critic.model(ids, attention)[:, :-1]
         advantages = masked_gae(rewards, values, mask, 1.0, 1.0)
         returns, advantages = advantages + values, masked_whiten(advantages, mask)
         for rows in minibatches(len(prompts), settings.minibatch, generator):
             logps = per_token_logps(policy.logits(ids[rows], attention[rows]), ids[rows])
             loss = ppo_token_loss(logps, old_logps[rows], advantages[rows], mask[rows])
-            errors = critic(ids[rows], attention[rows])[:, :-1] - returns[rows]
-            for one, its_loss in ((optimizer, loss), (its_optimizer, masked_mean(errors**2, mask[rows]))):
-                one.zero_grad()
-                its_loss.backward()
-            torch.nn.utils.clip_grad_norm_(policy.parameters(), settings.max_grad_norm)
-            optimizer.step()
-            its_optimizer.step()
+            errors = critic.model(ids[rows], attention[rows])[:, :-1] - returns[rows]
+            policy.step(loss, settings.max_grad_norm)
+            critic.step(masked_mean(errors**2, mask[rows]), settings.max_grad_norm)
         return {"reward": scores.mean().item()}
 
     return iteration
 
 
-def imitate(policy, optimizer, texts, settings, generator) -> None:
+def imitate(policy: Learner, texts, settings, generator) -> None:
     for rows in minibatches(len(texts), settings.minibatch, generator):
-        loss = next_token_loss(policy, [texts[row] for row in rows.tolist()])
-        optimizer.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(policy.parameters(), settings.max_grad_norm)
-        optimizer.step()
+        policy.step(next_token_loss(policy.model, [texts[row] for row in rows.tolist()]), settings.max_grad_norm)
 
 
-def supervised(policy, optimizer, prompts, verify, settings, generator) -> dict[str, float]:
+def supervised(policy, prompts, verify, settings, generator) -> dict[str, float]:
     """Right answers to as many prompts as GRPO has answers; each is worth a verifier's call."""
-    imitate(policy, optimizer, [prompt + answer(prompt) for prompt in prompts], settings, generator)
+    imitate(policy, [prompt + answer(prompt) for prompt in prompts], settings, generator)
     return {}
 
 
-def rejection(policy, optimizer, prompts, verify, settings, generator) -> dict[str, float]:
+def rejection(policy, prompts, verify, settings, generator) -> dict[str, float]:
     """Imitate those of the policy's own answers that were right."""
     asked = [prompt for prompt in prompts for _ in range(settings.group_size)]
     texts = policy.generate(asked, settings.new_tokens, generator=generator).texts
     rewards = verify(asked, texts)
     right = [prompt + text for prompt, text, reward in zip(asked, texts, rewards.tolist(), strict=True) if reward]
     if right:
-        imitate(policy, optimizer, right, settings, generator)
+        imitate(policy, right, settings, generator)
     return {"reward": rewards.mean().item()}
 
 
@@ -141,7 +132,7 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
         policy, seed, settings
     )
     asks = answers if method in ("ppo", "supervised") else settings.prompts
-    optimizer = torch.optim.AdamW(policy.parameters(), lr=settings.learning_rate, weight_decay=0.0)
+    learner = Learner(policy, settings.learning_rate)
     generator = seed_everything(100 + seed)
     seen: list[dict[str, float]] = []
 
@@ -180,7 +171,7 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
     for done in range(1, iterations + 1):
         begun = time.process_time()
         prompts = questions(asks, generator, digits)
-        logged.append(iteration(policy, optimizer, prompts, verify, settings, generator))
+        logged.append(iteration(learner, prompts, verify, settings, generator))
         seconds += time.process_time() - begun
         if done % ROWS == 0:
             recent = [one | two for one, two in zip(logged[-ROWS:], seen[-ROWS:] or [{}] * ROWS, strict=True)]

@@ -244,23 +244,23 @@ def sequence_ratio(logps, old_logps, mask):
     return (log_ratio.sum(1) / mask.sum(1)).exp()
 
 
-def grpo_iteration(policy, optimizer, prompts, verify, settings, generator):
+def grpo_iteration(policy, prompts, verify, settings, generator):
     """Let the policy answer, have the answers verified, and improve it on what came out.
 
-    Each of the P prompts is answered settings.group_size times, and the answers are compared
-    within their group. Then come settings.epochs passes over all of them, in minibatches:
-    for each a grpo_loss, its gradient, bounded in norm, and one step of the optimizer.
+    Each of the P prompts is asked settings.group_size times in a row, all in one call of
+    generate, and answers are compared within their group. Then come settings.epochs passes
+    over all answers in random minibatches: for each a grpo_loss, without a divergence, and
+    one step.
 
     Args:
-      policy: a language model, changed in place: policy.generate(prompts, max_new_tokens,
-        generator=generator) gives samples (input_ids, attention_mask, prompt_lengths,
-        texts), policy.logits(input_ids, attention_mask) gives (B, L, V), and policy.end_id
-        is the end token.
-      optimizer: of policy's parameters.
+      policy: changed in place; policy.generate(prompts, new_tokens, generator=generator)
+        gives samples (input_ids, attention_mask, prompt_lengths, texts),
+        policy.logits(input_ids, attention_mask) gives (B, L, V), policy.end_id is the end
+        token, and policy.step(loss, max_grad_norm) makes one step down the loss's gradient.
       prompts: P strings.
       verify: (prompts, completions) -> rewards (B,), for as many of one as of the other.
-      settings: course_lib.language.verifiable.GroupSettings: group_size, new_tokens,
-        baseline, scale, clip_low, clip_high, how, epochs, minibatch, max_grad_norm.
+      settings: group_size, new_tokens, baseline, scale, clip_low, clip_high, how, epochs,
+        minibatch (answers of a step), max_grad_norm; max_length is new_tokens.
       generator: of all draws.
 
     Returns: dict of floats: reward, the mean over all answers; silent, the share of groups
@@ -289,10 +289,7 @@ def grpo_iteration(policy, optimizer, prompts, verify, settings, generator):
                 how=settings.how,
                 max_length=length,
             )
-            optimizer.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(policy.parameters(), settings.max_grad_norm)
-            optimizer.step()
+            policy.step(loss, settings.max_grad_norm)
             logged.append(torch.stack([metrics["clipped_low"], metrics["clipped_high"]]))
     low, high = torch.stack(logged).mean(0).tolist()
     groups = rewards.reshape(-1, size)

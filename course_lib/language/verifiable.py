@@ -130,3 +130,74 @@ class GroupSettings:
     def but(self, **changes) -> GroupSettings:
         """These settings with some changed."""
         return replace(self, **changes)
+
+
+class Learner:
+    """A model with an optimiser: all that an iteration needs of a policy."""
+
+    def __init__(self, model: torch.nn.Module, learning_rate: float = GroupSettings.learning_rate):
+        self.model = model
+        self.optimizer = torch.optim.AdamW(model.parameters(), lr=learning_rate, weight_decay=0.0)
+
+    @property
+    def end_id(self) -> int:
+        return self.model.end_id
+
+    def generate(self, prompts: Sequence[str], max_new_tokens: int, generator: torch.Generator | None = None) -> lm.Samples:
+        return self.model.generate(prompts, max_new_tokens, generator=generator)
+
+    def logits(self, input_ids: torch.Tensor, attention_mask: torch.Tensor) -> torch.Tensor:
+        return self.model.logits(input_ids, attention_mask)
+
+    def step(self, loss: torch.Tensor, max_grad_norm: float) -> None:
+        """One step down the gradient of a loss, which is shortened to this norm if it is longer."""
+        self.optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.model.parameters(), max_grad_norm)
+        self.optimizer.step()
+
+
+class Table(torch.nn.Module):
+    """A policy that is a table, for trying an iteration out in milliseconds: it answers prompts of one digit, such as "2=".
+
+    Args:
+      table: logits of the token behind the digit ("=", which is given), of the first and of all later tokens of the answer, for each
+        digit; (D, 3, V). The last token of the vocabulary ends an answer, the last but one is "=".
+      learning_rate: of plain gradient descent.
+    """
+
+    def __init__(self, table: torch.Tensor, learning_rate: float):
+        super().__init__()
+        self.table = torch.nn.Parameter(table)
+        self.register_buffer("steps", torch.tensor(0))
+        self.learning_rate = learning_rate
+        self.end_id = table.shape[-1] - 1
+
+    def logits(self, input_ids: torch.Tensor, attention_mask: torch.Tensor) -> torch.Tensor:
+        return self.table[input_ids[:, :1], torch.arange(input_ids.shape[1]).clamp(max=2)]
+
+    @torch.no_grad()
+    def generate(self, prompts: Sequence[str], max_new_tokens: int, generator: torch.Generator | None = None) -> lm.Samples:
+        ids = torch.tensor([[int(prompt[0]), self.end_id - 1] for prompt in prompts])
+        mask = torch.ones_like(ids, dtype=torch.bool)
+        alive = mask[:, 0]
+        for _ in range(max_new_tokens):
+            drawn = torch.multinomial(self.logits(ids, mask)[:, -1].softmax(-1), 1, generator=generator).squeeze(1)
+            ids = torch.cat([ids, torch.where(alive, drawn, self.end_id)[:, None]], 1)
+            mask = torch.cat([mask, alive[:, None]], 1)
+            alive = alive & (drawn != self.end_id)
+        texts = ["".join(str(token) for token in row if token < self.end_id - 1) for row in ids[:, 2:].tolist()]
+        return lm.Samples(ids, mask, torch.full((len(ids),), 2), texts)
+
+    def step(self, loss: torch.Tensor, max_grad_norm: float) -> None:
+        (gradient,) = torch.autograd.grad(loss, self.table)
+        with torch.no_grad():
+            self.table -= self.learning_rate * gradient * (max_grad_norm / gradient.norm().clamp(min=max_grad_norm))
+            self.steps += 1
+
+
+def verifier(reward: float | None = None) -> Verify:
+    """Pays 1 for right answers, or always the same `reward`."""
+    return lambda prompts, completions: torch.tensor(
+        [float(text == answer(prompt)) if reward is None else reward for prompt, text in zip(prompts, completions, strict=True)]
+    )
