@@ -36,8 +36,8 @@ def pass_at_k(num_samples, num_correct, k):
 
         pass@k = 1 - C(n - c, k) / C(n, k) = 1 - Π_{i=0}^{k-1} (n - c - i) / (n - i)
 
-    The product stops at 0: with fewer than k wrong samples, pass@k is 1. Unbiased, which
-    1 - (1 - c/n)^k is not. Chen et al. (2021), eq. 1, https://arxiv.org/abs/2107.03374
+    With fewer than k wrong samples pass@k is 1. Unbiased, which 1 - (1 - c/n)^k is not.
+    Chen et al. (2021), eq. 1, https://arxiv.org/abs/2107.03374
 
     Args:
       num_samples: n, samples of each prompt; int.
