@@ -1034,8 +1034,12 @@ def _practice(generator, answers=8, prompts=("0=", "1=", "2="), reward=None, cer
     }
 
 
+def _in_a_row(prompts, size):
+    return [prompt for prompt in prompts for _ in range(size)]
+
+
 def _iterating(
-    ask=lambda prompts, size: [prompt for prompt in prompts for _ in range(size)],
+    ask=_in_a_row,
     advantages=lambda r, s: ch101.group_advantages(r, s.group_size, s.baseline, s.scale),
     mask=lambda samples, end: ch95.completion_mask(samples.input_ids, samples.prompt_lengths, end)[:, 1:],
     old=lambda old, new: old,
@@ -1203,7 +1207,7 @@ REPAIRED_ADVANTAGES = Exercise(
                 ),
                 "larger-epsilon": (
                     _repair(lambda x: _c(x) / (x.std(1, keepdim=True, correction=0) + 0.1)),
-                    "A larger eps makes the same difference worth less in some groups and more in others: the unit still depends on the group.",
+                    "A larger eps still makes one difference worth more in some groups than in others.",
                 ),
                 "divided-by-the-batch": (
                     _repair(lambda x: _c(x) / (x.std(correction=0) + 1e-6)),

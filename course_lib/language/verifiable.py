@@ -10,6 +10,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import tokenizers
 import torch
@@ -35,13 +36,13 @@ def fresh(seed: int, width: int = 64, layers: int = 2, heads: int = 4) -> lm.Lan
     splitter.pre_tokenizer = tokenizers.pre_tokenizers.Split("", "isolated")
     splitter.decoder = tokenizers.decoders.Fuse()
     seed_everything(seed)
-    config = transformers.GPT2Config(
+    config = transformers.GPT2Config(  # type: ignore[attr-defined]
         vocab_size=len(vocabulary), n_positions=32, n_embd=width, n_layer=layers, n_head=heads,
         resid_pdrop=0.0, embd_pdrop=0.0, attn_pdrop=0.0, activation_function="gelu_pytorch_tanh",
         bos_token_id=len(CHARACTERS), eos_token_id=len(CHARACTERS),
     )  # fmt: skip
     tokenizer = transformers.PreTrainedTokenizerFast(tokenizer_object=splitter)
-    return lm.LanguageModel(transformers.GPT2LMHeadModel(config), tokenizer).eval()
+    return lm.LanguageModel(transformers.GPT2LMHeadModel(config), tokenizer).eval()  # type: ignore[attr-defined]
 
 
 def answer(prompt: str) -> str:
@@ -135,7 +136,7 @@ class GroupSettings:
 class Learner:
     """A model with an optimiser: all that an iteration needs of a policy."""
 
-    def __init__(self, model: torch.nn.Module, learning_rate: float = GroupSettings.learning_rate):
+    def __init__(self, model: Any, learning_rate: float = GroupSettings.learning_rate):
         self.model = model
         self.optimizer = torch.optim.AdamW(model.parameters(), lr=learning_rate, weight_decay=0.0)
 
@@ -169,6 +170,7 @@ class Table(torch.nn.Module):
     def __init__(self, table: torch.Tensor, learning_rate: float):
         super().__init__()
         self.table = torch.nn.Parameter(table)
+        self.steps: torch.Tensor
         self.register_buffer("steps", torch.tensor(0))
         self.learning_rate = learning_rate
         self.end_id = table.shape[-1] - 1
@@ -192,8 +194,8 @@ class Table(torch.nn.Module):
     def step(self, loss: torch.Tensor, max_grad_norm: float) -> None:
         (gradient,) = torch.autograd.grad(loss, self.table)
         with torch.no_grad():
-            self.table -= self.learning_rate * gradient * (max_grad_norm / gradient.norm().clamp(min=max_grad_norm))
-            self.steps += 1
+            self.table.sub_(self.learning_rate * gradient * (max_grad_norm / gradient.norm().clamp(min=max_grad_norm)))
+            self.steps.add_(1)
 
 
 def verifier(reward: float | None = None) -> Verify:
