@@ -172,3 +172,23 @@ def _masks(outputs: dict[str, np.ndarray], paths: tuple[str, ...], size: int) ->
     if any(mask.dtype != bool for mask in masks):
         raise ValueError("train and held_out must be bool")
     return masks
+
+
+def answers_of_a_table(arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What a table of language.verifiable.Table has learned: for each prompt, whether it is answered rightly more often than not, and
+    whether the logits that stand before the answer have moved.
+
+    Args:
+      arguments: prompts of one digit each, and policy, as it was built.
+      outputs: "table" (D, 3, V).
+    """
+    if "table" not in outputs:
+        raise ValueError("there is no table")
+    table = torch.as_tensor(outputs["table"]).double()
+    before = torch.as_tensor(np.asarray(arguments["policy"]["arguments"]["table"])).double()
+    probabilities = table.softmax(-1)
+    right = [float(probabilities[int(p[0]), 1, int(p[0])] * probabilities[int(p[0]), 2, -1]) for p in arguments["prompts"]]
+    return {
+        "right more often than not": np.array([share > 0.5 for share in right]),
+        "logits before the answer moved": np.array(bool((table[:, 0] - before[:, 0]).abs().max() > 1e-3)),
+    }
