@@ -638,7 +638,7 @@ def _estimators(**other):
 KL_TERM = Exercise(
     name="kl_term",
     reference=ch101.kl_term,
-    criteria={"values": 0.75, "gradient": 0.5, "dtype": 0.1, "inputs": 0.1, "errors": 0.3},
+    criteria={"values": 0.9, "gradient": 0.45, "dtype": 0.1, "inputs": 0.1, "errors": 0.2},
     axes=("answer", "token"),
     cases=drawn_once(
         *(

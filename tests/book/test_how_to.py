@@ -44,6 +44,7 @@ SOURCES = (
     "book",
     "chapters",
     "course_lib",
+    "experiments",
     "solutions",
     "tests",
     "pyproject.toml",

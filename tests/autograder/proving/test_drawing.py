@@ -26,6 +26,7 @@ DRAWN = {
     },
     "ch45": {"What one action with advantage 1 asks of a Gaussian policy": ("gaussian_log_prob",)},
     "ch47": {"A Gaussian, squashed, and the correction of its log-density": ("squashed_gaussian_log_prob",)},
+    "ch48": {"What each run weighs, and what one odd run does to three means": ("interquartile_mean",)},
     "ch51": {"What the first λ-return is made of": ("dreamer_lambda_returns",)},
     "ch80": {"A choice, its loss, and how hard it pulls": ("preference_probability", "bradley_terry_loss")},
     "ch97": {"What one pair asks for": ("dpo_loss", "ipo_loss")},
