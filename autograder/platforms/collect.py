@@ -97,7 +97,8 @@ def collect(
     """
     known = frozenset(_grade_ids())
     if assignment is not None and assignment not in known:
-        raise CollectError(f"--assignment {assignment}: there is no such assignment; take one of {', '.join(sorted(known))}")
+        in_order = sorted(known, key=lambda name: (len(name), name))  # ch101 after ch97
+        raise CollectError(f"--assignment {assignment}: there is no such assignment; take one of {', '.join(in_order)}")
     if due is None and (into / deadlines.FILE).is_file():
         due = into / deadlines.FILE
     rules = deadlines.load(due, known) if due else Deadlines()

@@ -107,7 +107,8 @@ def find(submitted: Path, assignment: str | None = None, at_least: float = 0.6) 
     known = chapter.page_files()
     names = {f"ch{number}" for number in known}
     if assignment is not None and assignment not in names:
-        raise SimilarError(f"--assignment {assignment}: there is no such assignment; take one of {', '.join(sorted(names))}")
+        in_order = sorted(names, key=lambda name: (len(name), name))  # ch101 after ch97
+        raise SimilarError(f"--assignment {assignment}: there is no such assignment; take one of {', '.join(in_order)}")
     folders = _submissions(submitted, {assignment} if assignment else names)
     if not folders:
         raise SimilarError(f"{submitted}: no submissions in it. Expected STUDENT/ASSIGNMENT/ASSIGNMENT.ipynb, nbgrader's layout.")

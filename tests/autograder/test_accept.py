@@ -30,6 +30,7 @@ def course(tmp_path, monkeypatch, released):
 
     outline = assemble.outline(PAGE)
     release = SimpleNamespace(  # freezing its checks takes seconds
+        notebook=nbformat.reads(released, as_version=4),
         form=judge.repair.form(nbformat.reads(released, as_version=4)),
         exercises=[SimpleNamespace(name=name, points=points) for name, points in outline.exercises],
         open_questions=outline.open_questions,

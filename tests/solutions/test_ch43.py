@@ -8,12 +8,10 @@ import torch
 from solutions.ch43 import (
     approx_kl,
     clip_fraction,
-    clip_fraction_as,
     clipped_surrogate_loss,
     importance_ratio,
     repaired_losses,
     surrogate_loss,
-    which_diagnostics,
 )
 
 INF = math.inf
@@ -110,36 +108,6 @@ def test_approx_kl_weighted_by_the_acting_policy_is_the_divergence_from_it():
 @pytest.mark.parametrize(("clip_range", "expected"), [(0, 1), (0.2, 0.75), (0.4, 0.5), (0.6, 0.25), (3, 0), (INF, 0)])
 def test_clip_fraction_counts_both_sides(clip_range, expected):
     assert clip_fraction(with_ratios(2, 0.5, 0.7, 1.1), OLD, clip_range) == expected
-
-
-def test_silenced_are_those_whose_gradient_the_clip_takes_away_and_no_others():
-    good, bad = row(1, 1, 1, 1), row(-1, -1, -1, -1)  # ratios above, below, above, below
-    for advantages, silent in ((good, 0.5), (bad, 0.5), (row(1, -1, 1, -1), 1), (row(-1, 1, -1, 1), 0), (row(0, 0, 0, 0), 0)):
-        batch = with_ratios(*RATIOS), OLD, advantages
-        assert clip_fraction_as("silenced", *batch) == silent and clip_fraction_as("outside", *batch) == 1
-        assert clip_fraction_as("silenced", *batch, INF) == clip_fraction_as("outside", *batch, INF) == 0
-
-
-def test_a_log_tells_which_rules_made_its_two_numbers():
-    batch = with_ratios(2, 0.5, 2, 1), OLD, row(1, 1, -1, 1)
-    k1, k3 = -math.log(2) / 4, 1 / 4 * (1 + 0.5 + 0 - math.log(2)) - 0  # ρ - 1 adds up to 1.5
-    for kl, fraction, fits in (
-        (k1, 0.75, [True, False, True, False]),
-        (k3, 0.25, [False, True, False, True]),
-        (k3 + 1e-6, 0.5, [False, True, False, False]),
-        (k3 + 1e-3, 0.25, [False, False, False, True]),
-    ):
-        assert which_diagnostics(*row(kl, fraction), *batch).tolist() == fits
-
-
-def test_a_policy_that_stands_still_fits_every_rule():
-    assert which_diagnostics(*row(0, 0), OLD, OLD, OLD).all()
-
-
-@pytest.mark.parametrize("rule", ["clipped", "", None])
-def test_a_rule_that_is_none_is_refused_by_name(rule):
-    with pytest.raises(ValueError, match=f"rule.*{rule!r}"):
-        clip_fraction_as(rule, OLD, OLD, OLD)
 
 
 def test_repaired_losses_compare_every_epoch_with_the_policy_that_acted():

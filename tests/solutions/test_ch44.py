@@ -8,12 +8,10 @@ import torch
 from solutions.ch44 import (
     compute_gae,
     explained_variance,
-    gae_as,
     lambda_returns,
     normalize_advantages,
     repaired_targets,
     td_residuals,
-    which_gae,
 )
 
 
@@ -84,57 +82,6 @@ def test_repaired_targets_keep_the_returns_in_units_of_reward():
     plain = compute_gae(REWARDS, VALUES, NEXT, NO, NO, 0.5, 0.5)
     assert torch.equal(returns, plain + VALUES)
     assert torch.equal(advantages, normalize_advantages(plain))
-
-
-RULES = ["textbook", "termination", "leak", "current_value", "dropped"]
-AFTER_A_LIMIT = {"rewards": REWARDS, "values": VALUES, "next_values": column(20, 100, 40), "last_values": column(40)[0]}
-
-
-@pytest.mark.parametrize(
-    ("rule", "expected"),
-    [
-        ("textbook", [1 + 0.25 * 32, 32, -7]),
-        ("termination", [1 - 0.25 * 18, -18, -7]),
-        ("leak", [1 + 0.25 * (-3 - 0.25 * 7), -3 - 0.25 * 7, -7]),
-        ("current_value", [1 - 0.25 * 8, -8, -7]),
-        ("dropped", [1 + 0.5 * 20 - 10, 0, -7]),
-    ],
-)
-def test_rules_of_libraries_at_a_time_limit_by_hand(rule, expected):
-    assert (
-        gae_as(rule, **AFTER_A_LIMIT, terminated=NO, truncated=flags(0, 1, 0), gamma=0.5, gae_lambda=0.5).flatten().tolist()
-        == expected
-    )
-
-
-def test_dropped_looks_one_step_ahead_to_the_lambda_return():
-    rollout = AFTER_A_LIMIT | {"next_values": NEXT}
-    targets = [20 - 3 - 0.25 * 7, 30 - 7, 40]
-    expected = [reward + 0.5 * target - value for reward, target, value in zip((1, 2, 3), targets, (10, 20, 30), strict=True)]
-    assert gae_as("dropped", **rollout, terminated=NO, truncated=NO, gamma=0.5, gae_lambda=0.5).flatten().tolist() == expected
-
-
-def test_a_time_limit_that_is_not_seen_pays_the_first_episode_for_the_second():
-    nothing, limit = torch.zeros(4, 1, dtype=torch.float64), flags(0, 1, 0, 0)
-    rollout = (column(1, 1, 100, 1), nothing, nothing, nothing[0], torch.zeros_like(limit), limit)
-    assert (
-        gae_as("leak", *rollout, gamma=1, gae_lambda=1)[0] == 103 and gae_as("textbook", *rollout, gamma=1, gae_lambda=1)[0] == 2
-    )
-
-
-def test_advantages_of_a_log_tell_which_rules_can_have_made_them():
-    for truncated, expected in ((flags(0, 1, 0), {"leak"}), (NO, set(RULES) - {"dropped"})):
-        rollout = AFTER_A_LIMIT | {"terminated": NO, "truncated": truncated, "gamma": 0.5, "gae_lambda": 0.5}
-        rollout["next_values"] = rollout["next_values"] if truncated.any() else NEXT
-        logged = gae_as("leak", **rollout).float().double()
-        assert {rule for rule, fits in zip(RULES, which_gae(logged, RULES, **rollout), strict=True) if fits} == expected
-        assert not which_gae(logged + 0.01, RULES, **rollout).any()
-
-
-@pytest.mark.parametrize("rule", ["truncation", "", None])
-def test_a_rule_that_is_none_is_refused_by_name(rule):
-    with pytest.raises(ValueError, match=f"rule.*{rule!r}"):
-        gae_as(rule, **AFTER_A_LIMIT, terminated=NO, truncated=NO)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -51,10 +51,8 @@ def test_numbers_that_no_library_gave_are_an_error(records):
     ("assignment", "exercise", "misconception", "formula", "rule"),
     [
         ("ch43", "approx_kl", "log-ratio-estimator", "approx_kl", "k1"),
-        ("ch43", "clip_fraction_as", "outside-by-either-rule", "token_clip_fraction", "silenced"),
         ("ch44", "compute_gae", "truncated-treated-as-terminated", "gae", "truncation_as_end"),
         ("ch44", "repaired_targets", "truncated-treated-as-terminated", "gae", "truncation_as_end"),
-        ("ch44", "gae_as", "termination-taken-for-leak", "gae", "truncation_ignored"),
         ("ch47", "temperature_loss", "log-alpha-taken-as-alpha", "temperature_loss", "log_alpha"),
         ("ch95", "masked_whiten", "row-by-row", "whitened", "by_row"),
         ("ch95", "ppo_token_loss", "mean-of-row-means", "token_policy_loss", "row_means"),
