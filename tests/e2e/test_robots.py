@@ -30,6 +30,10 @@ def graded_as(notebook, name):
     return next(cell for cell in notebook.cells if cell.metadata.get("nbgrader", {}).get("grade_id") == name)
 
 
+BESIDE = ("autograder/__init__.py", "autograder/authoring/*.py", "autograder/checks/*.py", "solutions/*.py")
+BESIDE += ("experiments/__init__.py", "experiments/atlas/*.py", "experiments/atlas/records/*.json")  # whose rule a mistake is
+
+
 class Class:
     """A folder of submissions, made from the released notebook."""
 
@@ -53,18 +57,9 @@ class Class:
                 notebook, name
             ).source = f"from autograder.checks.ch44 import EXERCISES\n{name} = {pick(f'EXERCISES[{number}]')}"
         folder = self.hand_in(student, notebook)
-        for module in (
-            "autograder/__init__",
-            "autograder/authoring/__init__",
-            "autograder/authoring/parts",
-            "autograder/authoring/spec",
-            "autograder/checks/__init__",
-            "autograder/checks/ch44",
-            "solutions/__init__",
-            "solutions/ch44",
-        ):
-            (folder / module).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(ROOT / f"{module}.py", folder / f"{module}.py")
+        for path in [path for pattern in BESIDE for path in ROOT.glob(pattern)]:
+            (folder / path.relative_to(ROOT)).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(path, folder / path.relative_to(ROOT))
 
 
 @pytest.fixture(scope="module")
