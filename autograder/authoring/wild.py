@@ -9,10 +9,7 @@ import functools
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-import torch
-
 from experiments.atlas import keeping
-from experiments.atlas.given import GIVEN
 
 _Found = tuple[Mapping[str, Any], Mapping[str, Any]]
 
@@ -30,23 +27,6 @@ def also(rule: str, *formulas: str, what: str = "this is") -> str:
         return ""
     listed = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
     return f" In the wild, {what} the rule of {listed}."
-
-
-def numbers(library: str, formula: str, rule: str = "") -> torch.Tensor:
-    """What a library computed by this rule ("": as the course does), in double precision.
-
-    Raises: LookupError if its record has no such row.
-    """
-    rows = [row for record, row in _rows(formula) if library in record["versions"] and _rule(row) == rule]
-    if not rows:
-        raise LookupError(f"the atlas has no row of {library} on {formula} by the rule {rule!r}")
-    return torch.tensor(rows[0]["numbers"], dtype=torch.float64)
-
-
-def given(name: str) -> torch.Tensor:
-    """A part of the input that all libraries were given: floats in double precision; masks as bool."""
-    value = torch.tensor(GIVEN[name], dtype=torch.float64)
-    return value.bool() if name in ("terminated", "truncated", "mask") else value
 
 
 @functools.cache

@@ -39,14 +39,6 @@ def test_nothing_is_said_of_rules_that_nobody_follows_without_reservation(record
     assert wild.also("leaks", "gae") == wild.also("stops", "gae") == wild.also("", "gae") == ""
 
 
-def test_numbers_that_no_library_gave_are_an_error(records):
-    records |= {"a": row("a", "leaks")}
-    assert wild.numbers("a", "gae", "leaks").tolist() == [1.0]
-    for library, rule in (("b", "leaks"), ("a", "")):
-        with pytest.raises(LookupError, match=library):
-            wild.numbers(library, "gae", rule)
-
-
 @pytest.mark.parametrize(
     ("assignment", "exercise", "misconception", "formula", "rule"),
     [
