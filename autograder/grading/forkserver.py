@@ -42,6 +42,7 @@ SECCOMP_MODE_FILTER = 2
 CAPABILITY_VERSION_3 = 0x20080522
 SIOCSIFFLAGS, IFF_UP_RUNNING = 0x8914, 0x41
 NOBODY = 65534
+LARGE, MADV_COLLAPSE = 1 << 21, 25  # bytes; the second is in no module of the standard library
 MOST_FILES = 250  # descriptors in one message; the kernel allows 253
 
 libc = ctypes.CDLL(None, use_errno=True)
@@ -61,7 +62,11 @@ def main() -> NoReturn:
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # keepers are nobody's to wait for
     judge = socket.socket(fileno=number)
     judge.send(b"+")
+    pages = pages_to_gather()
     while True:
+        if pages and not select.select([judge], [], [], 0)[0]:
+            libc.madvise(ctypes.c_void_p(pages.pop()), ctypes.c_size_t(LARGE), MADV_COLLAPSE)
+            continue
         word, descriptors, _, _ = socket.recv_fds(judge, 1, 3)
         if not word:
             os._exit(0)
@@ -82,6 +87,21 @@ def become_nobody() -> None:
         os.setresuid(NOBODY, NOBODY, NOBODY)
         no_capabilities()
         call(libc.prctl, PR_SET_DUMPABLE, 1, 0, 0, 0)  # or its own files in /proc would be root's
+
+
+def pages_to_gather() -> list[int]:
+    """Addresses in this process's memory of what can each become one page of 2 MB, of which a fork lists, and an end lets go, far fewer.
+
+    While nobody asks for a process they are gathered, one every few milliseconds; kernels before Linux 6.1 refuse, and nothing is lost.
+    """
+    with open("/proc/self/maps", encoding="utf-8") as file:
+        areas = [line.split() for line in file]
+    found: list[int] = []
+    for place, rights, *_, name in (area if len(area) > 5 else [*area, ""] for area in areas):
+        begin, end = (int(number, 16) for number in place.split("-"))
+        if rights == "rw-p" and name in ("", "[heap]"):
+            found += range(-(-begin // LARGE) * LARGE, end // LARGE * LARGE, LARGE)
+    return found
 
 
 # ---- the keeper -----------------------------------------------------------------------------------------------------

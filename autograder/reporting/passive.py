@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from nbformat import NotebookNode
-from nbformat.v4 import new_code_cell, new_markdown_cell, new_output, new_raw_cell
+from nbformat.v4 import new_output
 
 # What Markdown or MathJax would turn into markup: a tag, a link (nbconvert lets javascript: links pass), an active TeX command.
 _ACTIVE = re.compile(r"<(?=[A-Za-z/!?])|\](?=[(:\[])|\\(?=href|require|style|class|cssId)")
@@ -26,17 +26,17 @@ def text(markdown: str) -> str:
 
 def cell(theirs: NotebookNode, untouched: Mapping[str, NotebookNode]) -> NotebookNode:
     """A fresh cell with the same text, of which nothing is active. `untouched` has the cells that were handed out, by their texts: what a
-    chapter's author wrote may have links and pictures."""
+    chapter's author wrote may have links and pictures. It has no id, and nbformat's check of it is left to the notebook's."""
     metadata = NotebookNode(theirs.metadata)
     original: Mapping[str, Any] = untouched.get(theirs.source, {})
     if theirs.cell_type == "code":
         outputs = [kept for output in theirs.get("outputs", []) if (kept := _output(output))]
-        return new_code_cell(theirs.source, outputs=outputs, metadata=metadata)
+        return NotebookNode(cell_type="code", execution_count=None, source=theirs.source, outputs=outputs, metadata=metadata)
     source = theirs.source if original else text(theirs.source)
     if theirs.cell_type == "markdown":
         pictures = {"attachments": original["attachments"]} if "attachments" in original else {}
-        return new_markdown_cell(source, metadata=metadata, **pictures)
-    return new_raw_cell(source, metadata=metadata)
+        return NotebookNode(cell_type="markdown", source=source, metadata=metadata, **pictures)
+    return NotebookNode(cell_type="raw", source=source, metadata=metadata)
 
 
 def _output(output: NotebookNode) -> NotebookNode | None:
