@@ -18,7 +18,8 @@ def clip_fraction_as(rule, log_probs, old_log_probs, advantages, clip_range=0.2)
 
     Rule "outside" counts the samples whose ratio has left [1 - ε, 1 + ε], on either side.
     Rule "silenced" gives the silent fraction: it counts only those whose gradient the clip
-    takes away. A sample whose advantage is 0 has none to lose.
+    takes away. A sample whose advantage is 0 has none to lose. The clip is that of Schulman
+    et al. (2017), eq. 7, https://arxiv.org/abs/1707.06347
 
     Args:
       rule: "outside" or "silenced".
@@ -50,10 +51,11 @@ def which_diagnostics(
 ):
     """Which rules made the two numbers that a library has logged for a batch.
 
-        |logged - computed| ≤ 1e-5 max(1, |logged|)
+        |logged - computed| ≤ 1e-5 max(1, |logged|),   ρ = exp(log_probs - old_log_probs)
 
     Logs are in single precision, hence the tolerance. Where two rules agree, both fit; where
-    the library follows another one, none does.
+    the library follows another one, none does. k1 and k3 are named by Schulman (2020),
+    http://joschu.net/blog/kl-approx.html
 
     Args:
       logged_kl: the "approximate KL" in nats; scalar (0-dim).
@@ -63,8 +65,8 @@ def which_diagnostics(
       advantages: (B,), in units of reward unless normalised.
       clip_range: ε ≥ 0, dimensionless; infinity means no clipping.
 
-    Returns: (4,) bool tensor: whether logged_kl fits k1, the mean of -log ρ, and k3; and
-      whether logged_fraction fits "outside" and "silenced" of clip_fraction_as.
+    Returns: (4,) bool tensor: whether logged_kl fits k1, the mean of -log ρ, and k3, that of
+      ρ - 1 - log ρ; whether logged_fraction fits "outside" and "silenced" of clip_fraction_as.
     Raises: ValueError that names an argument if the shapes of the batch differ or
       clip_range < 0.
     """
@@ -103,6 +105,9 @@ def gae_as(
       target: r_t + γ (1 - terminated_t) G_{t+1} - V(s_t). There G_{t+1} is last_values after
       the last row, and else V + A of row t + 1, where A is the sum of "termination" but with
       δ = 0 at truncated steps.
+
+    The first is Schulman et al. (2016), eq. 16, https://arxiv.org/abs/1506.02438; who follows
+    the others is said in the book's appendix on other libraries.
 
     Args:
       rule: one of these names.
@@ -182,8 +187,8 @@ def which_gae(
 def repaired_bootstrap(
     stored_rewards, values, next_values, terminated, truncated, gamma=0.99, gae_lambda=0.95
 ):
-    """What the suspect program should have taken for advantages: those of the rewards as the
-    environment paid them, each future counted once.
+    """What the suspect program should have taken for advantages: those that compute_gae gives
+    of the rewards as the environment paid them, each future counted once.
 
     Args:
       stored_rewards: as the collector of the lab has stored them, in units of reward; (T, N).
