@@ -7,8 +7,6 @@ from __future__ import annotations
 import torch
 
 from course_lib import validate
-from solutions.ch43 import approx_kl, clip_fraction, importance_ratio
-from solutions.ch44 import compute_gae, td_residuals
 
 
 def clip_fraction_as(rule, log_probs, old_log_probs, advantages, clip_range=0.2):
@@ -37,13 +35,12 @@ def clip_fraction_as(rule, log_probs, old_log_probs, advantages, clip_range=0.2)
     validate.same_shape(
         log_probs=log_probs, old_log_probs=old_log_probs, advantages=advantages
     )
-    if rule == "outside":
-        return clip_fraction(log_probs, old_log_probs, clip_range)
     validate.non_negative(clip_range=clip_range)
-    ratio = importance_ratio(log_probs, old_log_probs)
-    passed = (advantages > 0) & (ratio > 1 + clip_range)
-    passed |= (advantages < 0) & (ratio < 1 - clip_range)
-    return passed.to(log_probs.dtype).mean()
+    ratio = (log_probs - old_log_probs).exp()
+    above, below = ratio > 1 + clip_range, ratio < 1 - clip_range
+    if rule == "silenced":
+        above, below = above & (advantages > 0), below & (advantages < 0)
+    return (above | below).to(log_probs.dtype).mean()
 
 
 def which_diagnostics(
@@ -72,8 +69,9 @@ def which_diagnostics(
     """
     batch = (log_probs, old_log_probs, advantages, clip_range)
     fractions = [clip_fraction_as(rule, *batch) for rule in ("outside", "silenced")]
-    kls = [(old_log_probs - log_probs).mean(), approx_kl(log_probs, old_log_probs)]
-    computed = torch.stack([*kls, *fractions]).detach()
+    log_ratio = log_probs - old_log_probs
+    k1, k3 = -log_ratio.mean(), (log_ratio.expm1() - log_ratio).mean()
+    computed = torch.stack([k1, k3, *fractions]).detach()
     logged = torch.stack([logged_kl, logged_kl, logged_fraction, logged_fraction])
     return (logged - computed).abs() <= 1e-5 * logged.abs().clamp(min=1)
 
@@ -94,7 +92,8 @@ def gae_as(
 
         A_t = δ_t + γ λ c_t A_{t+1},   δ_t and c_t by the rule
 
-    - "textbook": those of compute_gae.
+    - "textbook": as compute_gae of chapter 44. δ_t is r_t + γ V(s_{t+1}) - V(s_t), without the
+      second term where the task ended; c_t is 0 where it ended or was cut, else 1.
     - "termination": a time limit counts as an end of the task.
     - "leak": a time limit is not seen. The value in row t + 1, of whatever episode, stands in
       for that of the successor, and the sum runs on into that row.
@@ -131,21 +130,28 @@ def gae_as(
     flags = {"terminated": terminated, "truncated": truncated}
     validate.same_shape(rewards=rewards, values=values, next_values=next_values, **flags)
     validate.same_shape(last_values=last_values, values=values[-1])
-    settings = (gamma, gae_lambda)
-    if rule == "textbook":
-        return compute_gae(rewards, values, next_values, terminated, truncated, *settings)
-    ended, never = terminated | truncated, torch.zeros_like(terminated)
+    validate.unit_interval(gamma=gamma, gae_lambda=gae_lambda)
+    ended = terminated | truncated
     following = torch.cat([values[1:], last_values[None]])
-    if rule == "leak":
-        return compute_gae(rewards, values, following, terminated, never, *settings)
+    if rule == "textbook":
+        bootstraps, stops, following = ~terminated, ended, next_values
+    elif rule == "leak":
+        bootstraps, stops = ~terminated, terminated
+    else:
+        bootstraps, stops = ~ended, ended
+    deltas = rewards + gamma * following * bootstraps - values
     if rule == "current_value":
-        rewards = rewards + gamma * values * truncated
+        deltas = deltas + gamma * values * truncated
     if rule == "dropped":
-        passed_over = torch.where(truncated, values, rewards)
-        sums = compute_gae(passed_over, values, following, ended, never, *settings)
-        targets = torch.cat([(values + sums)[1:], last_values[None]])
-        return td_residuals(rewards, values, targets, terminated, gamma) * ~truncated
-    return compute_gae(rewards, values, following, ended, never, *settings)
+        deltas = deltas * ~truncated
+    advantages, later = torch.zeros_like(deltas), torch.zeros_like(deltas[0])
+    for t in reversed(range(len(deltas))):
+        later = deltas[t] + gamma * gae_lambda * later * ~stops[t]
+        advantages[t] = later
+    if rule == "dropped":
+        targets = torch.cat([(values + advantages)[1:], last_values[None]])
+        advantages = (rewards + gamma * targets * ~terminated - values) * ~truncated
+    return advantages.detach()
 
 
 def which_gae(
@@ -187,8 +193,8 @@ def which_gae(
 def repaired_bootstrap(
     stored_rewards, values, next_values, terminated, truncated, gamma=0.99, gae_lambda=0.95
 ):
-    """What the suspect program should have taken for advantages: those that compute_gae gives
-    of the rewards as the environment paid them, each future counted once.
+    """What the suspect program should have taken for advantages: those that gae_as("textbook")
+    gives of the rewards as the environment paid them, each future counted once.
 
     Args:
       stored_rewards: as the collector of the lab has stored them, in units of reward; (T, N).
@@ -208,6 +214,6 @@ def repaired_bootstrap(
     flags = {"terminated": terminated, "truncated": truncated}
     shapes = {"stored_rewards": stored_rewards, "values": values, "next_values": next_values}
     validate.same_shape(**shapes, **flags)
-    validate.unit_interval(gamma=gamma, gae_lambda=gae_lambda)
     rewards = stored_rewards - gamma * next_values * (truncated & ~terminated)
-    return compute_gae(rewards, values, next_values, terminated, truncated, gamma, gae_lambda)
+    rollout = (rewards, values, next_values, next_values[-1], terminated, truncated)
+    return gae_as("textbook", *rollout, gamma, gae_lambda)
