@@ -29,6 +29,7 @@ POINTS = sum(exercise.points for exercise in ALL)
 BESIDE = ("autograder/__init__.py", "autograder/authoring/*.py", "autograder/checks/*.py", "solutions/*.py")
 BESIDE += (
     "experiments/__init__.py",
+    "experiments/atlas/given.py",
     "experiments/atlas/keeping.py",
     "experiments/atlas/records/*.json",
 )  # whose rule a mistake is

@@ -49,6 +49,11 @@ def test_nothing_is_said_of_rules_that_nobody_follows_without_reservation(record
         ("ch95", "masked_whiten", "row-by-row", "whitened", "by_row"),
         ("ch95", "ppo_token_loss", "mean-of-row-means", "token_policy_loss", "row_means"),
         ("ch97", "dpo_loss", "smoothing-ignored", "dpo_loss_smoothed_mean", "ignored"),
+        ("ch102", "clip_fraction_as", "outside-by-either-rule", "token_clip_fraction", "silenced"),
+        ("ch102", "which_diagnostics", "k1-never-negative", "approx_kl", "k1"),
+        ("ch102", "gae_as", "always-termination", "gae", "truncation_as_end"),
+        ("ch102", "gae_as", "termination-taken-for-leak", "gae", "truncation_ignored"),
+        ("ch102", "repaired_bootstrap", "future-counted-twice", "stored_reward", ""),
     ],
 )
 def test_what_a_learner_reads_names_a_library_of_the_records(assignment, exercise, misconception, formula, rule):

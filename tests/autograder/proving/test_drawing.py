@@ -30,6 +30,7 @@ DRAWN = {
     "ch51": {"What the first λ-return is made of": ("dreamer_lambda_returns",)},
     "ch80": {"A choice, its loss, and how hard it pulls": ("preference_probability", "bradley_terry_loss")},
     "ch97": {"What one pair asks for": ("dpo_loss", "ipo_loss")},
+    "ch102": {"Where a single 1 comes out, by each rule": ("gae_as",)},
 }
 ELSEWHERE = {
     "ch45": {"Eight epochs on one batch": "course_lib.control.envs.HoverVectorEnv"},
