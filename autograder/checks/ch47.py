@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from types import SimpleNamespace
 
 import torch
@@ -112,10 +113,17 @@ def _soft_maximum(q, alpha):
 
 
 def _sweeping(
-    value=_soft_maximum, policy=lambda q, alpha: (q / alpha).softmax(-1), back=_backed_up, more=0, late=0, data=True, checked=True
+    value=_soft_maximum,
+    policy=lambda q, alpha: (q / alpha).softmax(-1),
+    back=_backed_up,
+    more=0,
+    late=0,
+    ahead=0,
+    data=True,
+    checked=True,
 ):
-    """A version: `value` of a state's row of Q, `policy` of all rows, `back` for the first line; `more` sweeps than asked for, and
-    values that are `late`, of the sweep before.
+    """A version: `value` of a state's row of Q, `policy` of all rows, `back` for the first line; `more` sweeps than asked for, values
+    that are `late`, of so many sweeps before, and a Q that is `ahead` by so many first lines.
     """
 
     def version(rewards, transitions, alpha, gamma, num_sweeps):
@@ -124,6 +132,8 @@ def _sweeping(
         for _ in range(num_sweeps + more):
             q = back(r, transitions, history[-1], gamma)
             history.append(value(q, alpha))
+        for _ in range(ahead):
+            q = back(r, transitions, history[-1], gamma)
         return q, history[-1 - late], policy(q, alpha)
 
     return _iterated(version, checked)
@@ -209,6 +219,10 @@ _WRONG_SOFT_VALUE_ITERATION = {
         {"late": 1},
         "The values are those of the sweep before: they are to be the soft maximum of the Q that is returned.",
     ),
+    "q-of-the-sweep-after": (
+        {"ahead": 1},
+        "Q is made once more after the last values: return the Q of which these values are the soft maximum, and its policy.",
+    ),
     "graph-kept": (
         {"data": False},
         "The results carry the graph of all sweeps, which nobody differentiates: compute them under torch.no_grad().",
@@ -253,7 +267,15 @@ SOFT_VALUE_ITERATION = Exercise(
             draws=1,
             visible=True,
         ),
-        misshapen("rewards of the states alone", _problem(), "rewards", lambda r: r[:, 0], raises=_TABLES, draws=1),
+        misshapen(
+            "rewards of the states alone",
+            _problem(),
+            "rewards",
+            lambda r: r[:, 0],
+            raises=_TABLES,
+            draws=1,
+            visible=True,
+        ),
         refused(_problem(), alpha=0.0, visible=True),
         refused(_problem(), alpha=-0.5),
         refused(_problem(), gamma=1.2, visible=True),
@@ -360,6 +382,10 @@ _WRONG_SQUASHED_GAUSSIAN_LOG_PROB = {
     "clamped": (
         lambda m, s, u: (_normal(m, s, u) - (1 - u.tanh().square()).clamp(1e-6, 1).log()).sum(-1),
         "The clamp avoids -inf, but beyond it the density is wrong and its gradient 0: use 2 (log 2 - u - softplus(-2u)).",
+    ),
+    "half-of-the-correction": (
+        lambda m, s, u: (_normal(m, s, u) - 0.5 * _slope(u)).sum(-1),
+        "log(1 - tanh² u) is *twice* log 2 - u - softplus(-2u): the factor 2 comes from the square and is missing.",
     ),
     "slope-without-square": (
         lambda m, s, u: (_normal(m, s, u) - (1 - u.tanh()).clamp_min(1e-300).log()).sum(-1),
@@ -539,6 +565,11 @@ _WRONG_SOFT_Q_TARGET = {
     "entropy-not-discounted": (
         lambda r, c, q1, q2, lp, alpha, gamma: r + c * (gamma * torch.minimum(q1, q2) - alpha * lp),
         "The entropy is that of the next action, one step away: it is discounted as the value is.",
+    ),
+    "entropy-outside-the-bracket": (
+        lambda r, c, q1, q2, lp, alpha, gamma: r + gamma * c * torch.minimum(q1, q2) - alpha * lp,
+        "The entropy term stands outside the bracket: it is the next action's, so it is discounted as the value is, and falls away"
+        " where the task has ended.",
     ),
     "end-ignored": (_fixed(c=1.0), "terminated is not used: nothing follows where the task has ended."),
     "end-inverted": (
@@ -1095,16 +1126,16 @@ def _one_update(generator, size=12, actions=2, learning_rate=0.3, alpha=0.1, gam
     }
 
 
-def _acting(agent, obs, noise):
+def _acting(agent, obs, noise, std=torch.exp, squash=torch.tanh):
     mean, log_std = agent.distribution(obs)
-    u = mean + log_std.exp() * noise
-    return u.tanh(), ch47.squashed_gaussian_log_prob(mean, log_std, u)
+    u = mean + std(log_std) * noise
+    return squash(u), ch47.squashed_gaussian_log_prob(mean, log_std, u)
 
 
-def _targets(agent, batch, next_noise, alpha, gamma, networks=None, obs=None, judged=None):
+def _targets(agent, batch, next_noise, alpha, gamma, networks=None, obs=None, judged=None, acting=_acting):
     with torch.no_grad():
         at = batch.next_obs if obs is None else obs
-        actions, log_probs = _acting(agent, at, next_noise)
+        actions, log_probs = acting(agent, at, next_noise)
         q1, q2 = sac.values(networks or agent.targets, at if judged is None else judged, actions)
     return ch47.soft_q_target(batch.rewards, batch.terminated, q1, q2, log_probs, alpha, gamma)
 
@@ -1116,9 +1147,9 @@ def _step_of_critics(agent, batch, targets):
     return loss.detach()
 
 
-def _step_of_policy(agent, obs, noise, alpha, networks=None, gradient=True):
+def _step_of_policy(agent, obs, noise, alpha, networks=None, gradient=True, acting=_acting):
     """A step of the policy; its loss and the log-probabilities of its actions. `gradient` says whether any passes through the actions."""
-    actions, log_probs = _acting(agent, obs, noise)
+    actions, log_probs = acting(agent, obs, noise)
     q1, q2 = sac.values(networks or agent.critics, obs, actions if gradient else actions.detach(), learn=False)
     loss = ch47.sac_actor_loss(q1, q2, log_probs, alpha)
     sac.minimise(loss, agent.actor_optimizer)
@@ -1149,30 +1180,45 @@ def _updating(
     temperature=_step_of_temperature,
     thermometer=lambda agent, batch, log_probs: log_probs,
     follow=_follow,
-    policy_first=False,
-    follow_first=False,
+    order="target critics policy temperature copies",
+    acting=_acting,
     one_noise=False,
     told=_told,
 ):
-    """A version of the program, from the places where it can go wrong."""
+    """A version of the program, from the places where it can go wrong; `order` says what comes when, and `acting` draws all actions."""
+    if acting is not _acting:
+        targets, policy = partial(targets, acting=acting), partial(policy, acting=acting)
 
     def version(agent, batch, next_noise, noise, settings):
         alpha = price(agent)
         if one_noise:
             next_noise = noise
-        if policy_first:
-            of_policy, log_probs = policy(agent, policy_obs(batch), noise, alpha)
-        if follow_first:
-            follow(agent, settings)
-        of_critics = critics(agent, batch, targets(agent, batch, next_noise, alpha, settings.gamma))
-        if not policy_first:
-            of_policy, log_probs = policy(agent, policy_obs(batch), noise, alpha)
-        of_temperature = temperature(agent, thermometer(agent, batch, log_probs))
-        if not follow_first:
-            follow(agent, settings)
+        for part in order.split():
+            if part == "target":
+                y = targets(agent, batch, next_noise, alpha, settings.gamma)
+            elif part == "critics":
+                of_critics = critics(agent, batch, y)
+            elif part == "policy":
+                of_policy, log_probs = policy(agent, policy_obs(batch), noise, alpha)
+            elif part == "temperature":
+                of_temperature = temperature(agent, thermometer(agent, batch, log_probs))
+            else:
+                follow(agent, settings)
         return told(of_critics, of_policy, of_temperature, log_probs)
 
     return version
+
+
+def _at_the_new_price(agent, batch, next_noise, noise, settings):
+    """The temperature before the policy, whose loss has the price that comes of it."""
+    alpha = agent.log_alpha.detach().exp()
+    of_critics = _step_of_critics(agent, batch, _targets(agent, batch, next_noise, alpha, settings.gamma))
+    with torch.no_grad():
+        _, log_probs = _acting(agent, batch.obs, noise)
+    of_temperature = _step_of_temperature(agent, log_probs)
+    of_policy, log_probs = _step_of_policy(agent, batch.obs, noise, agent.log_alpha.detach().exp())
+    _follow(agent, settings)
+    return _told(of_critics, of_policy, of_temperature, log_probs)
 
 
 def _leaking(agent, obs, noise, alpha):
@@ -1274,12 +1320,32 @@ _WRONG_SAC_UPDATE = {
         "next_noise is not used: it makes the actions in next_obs, noise those in obs.",
     ),
     "policy-before-the-critics": (
-        {"policy_first": True},
+        {"order": "policy target critics temperature copies"},
         "The policy moves before the critics: its loss, and the target's action, are then those of other networks. Critics first.",
     ),
-    "copies-before-the-critics": (
-        {"follow_first": True},
+    "policy-between-target-and-critics": (
+        {"order": "target policy critics temperature copies"},
+        "The policy is judged by the critics as they were before their step: move the critics first.",
+    ),
+    "copies-before-the-target": (
+        {"order": "copies target critics policy temperature"},
         "The slow copies move before they have made the target, and towards the critics of the update before: they come last.",
+    ),
+    "copies-before-the-critics": (
+        {"order": "target copies critics policy temperature"},
+        "The slow copies move towards the critics as they were before their step: they follow the critics that have just become.",
+    ),
+    "gamma-by-default": (
+        {"targets": lambda agent, batch, noise, alpha, gamma: _targets(agent, batch, noise, alpha, 0.99)},
+        "settings.gamma is not handed to soft_q_target, which then takes its default, 0.99.",
+    ),
+    "log-std-for-std": (
+        {"acting": partial(_acting, std=lambda log_std: log_std)},
+        "The noise is multiplied by log_std: the standard deviation is its exponential.",
+    ),
+    "actions-not-squashed": (
+        {"acting": partial(_acting, squash=lambda u: u)},
+        "The critics are asked about u = μ + σ ε: an action is tanh(u).",
     ),
     "copies-left-behind": ({"follow": lambda agent, settings: None}, "The slow copies do not move: polyak_update is missing."),
     "copies-copied": (
@@ -1368,7 +1434,14 @@ SAC_UPDATE = Exercise(
         _afterwards("learning rate 0: the copies alone move", _one_update(learning_rate=0.0, tau=0.5), visible=True),
         _reported("every step ends", _one_update(ended=1.1)),
     ),
-    misconceptions=wrong(_WRONG_SAC_UPDATE, lambda parts: _updating(**parts)),
+    misconceptions=(
+        *wrong(_WRONG_SAC_UPDATE, lambda parts: _updating(**parts)),
+        Misconception(
+            "policy-at-the-new-price",
+            _at_the_new_price,
+            "The temperature moves first, and the policy's loss has its new α: take alpha once, at the top, for all that follows.",
+        ),
+    ),
     variants={
         "step by step": _updating(),
         "everything written out": _by_hand,
@@ -1395,11 +1468,11 @@ def _copies(generator, size=8, tau=0.2, pattern=None):
 _followed = versions_of(ch47.repaired_follow, one_shape(*_WEIGHTS), satisfies(lambda tau: 0 <= tau <= 1))
 
 
-def _following(move, checked=True):
-    """A version: `move(target, online, first, tau)` changes the copies, without a graph."""
+def _following(move, checked=True, graph=False):
+    """A version: `move(target, online, first, tau)` changes the copies, without a graph unless it is asked for."""
 
     def version(target_weights, online_weights, first, tau):
-        with torch.no_grad():
+        with torch.set_grad_enabled(graph):
             move(target_weights, online_weights, first, tau)
 
     return _followed(version, checked)
@@ -1447,6 +1520,12 @@ _WRONG_FOLLOW = {
         lambda target, online, first, tau: target.lerp_(online, _share(~first, tau, target)),
         "The first critic's copy follows by half of tau, and the second's by tau: it is the other way round.",
     ),
+    "halves-by-place": (
+        lambda target, online, first, tau: target.lerp_(
+            online, _share(torch.arange(len(target)) < len(target) // 2, tau, target)
+        ),
+        "The first half of the vector follows by tau, the rest by half of it: `first` says which weights are the first critic's.",
+    ),
     "first-only": (
         lambda target, online, first, tau: target.lerp_(online, torch.where(first, tau, 0.0).to(target.dtype)),
         "The second critic's copy does not move: it follows by half of tau.",
@@ -1476,7 +1555,7 @@ _WRONG_FOLLOW = {
 REPAIRED_FOLLOW = Exercise(
     name="repaired_follow",
     reference=ch47.repaired_follow,
-    criteria={"values": 1.5, "dtype": 0.1, "inputs": 0.2, "errors": 0.2},
+    criteria={"values": 1.5, "gradient": 0.1, "dtype": 0.1, "inputs": 0.1, "errors": 0.2},
     axes=("weight",),
     cases=drawn_once(
         _followed_by("eight weights in no order", _copies(), visible=True, draws=2),
@@ -1485,6 +1564,7 @@ REPAIRED_FOLLOW = Exercise(
         _followed_by("tau = 0: nothing moves", _copies(tau=0.0), visible=True),
         _followed_by("all weights are the first critic's", _copies(pattern=True)),
         _followed_by("none is", _copies(pattern=False)),
+        _followed_by("all weights require gradient", _copies(), differentiate=_WEIGHTS[:2], visible=True),
         _followed_by("single precision", _copies(), dtype=torch.float32, visible=True),
         *shape_cases(_copies(), _WEIGHTS),
         refused(_copies(), tau=1.5, visible=True),
@@ -1492,6 +1572,12 @@ REPAIRED_FOLLOW = Exercise(
     ),
     misconceptions=(
         *wrong(_WRONG_FOLLOW, _following),
+        Misconception(
+            "graph-kept",
+            _following(_by_masks, graph=True),
+            "The update is recorded in the graph, and PyTorch refuses to change weights that require gradient in place: do it under"
+            " torch.no_grad().",
+        ),
         bad_input_accepted(_following(_by_masks, checked=False)),
     ),
     variants={
