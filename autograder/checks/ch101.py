@@ -541,6 +541,10 @@ AGGREGATE_LOSS = Exercise(
                     _aggregate(tokens=lambda x, m: x.mean(), sequences=lambda x, m: x.mean()),
                     "The sum is divided by the size of the tensor, padding included: the loss depends on the longest answer.",
                 ),
+                "how-ignored": (
+                    lambda x, m, how, n: _aggregate()(x, m, "tokens", n),
+                    "how is ignored: whatever it says, the mean over all tokens comes out.",
+                ),
                 "tokens-by-rows": (
                     _aggregate(tokens=lambda x, m: (x.sum(1) / m.sum(1)).mean()),
                     "With tokens every token of the batch weighs the same: this is the mean of row means.",
