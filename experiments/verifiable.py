@@ -38,6 +38,7 @@ VARIANTS: dict[str, dict] = {
     "lab_repaired": MIXED | {"price": PRICE, "scale": "none"},
     "strong": COMMON | {"warm_up": STRONG},
     "hole": COMMON | {"verifier": "ascending"},
+    **{f"group_{size}": COMMON | {"prompts": 192 // size, "group_size": size} for size in (2, 4, 16, 32)},
     **{f"digits_{n}": COMMON | {"digits": [n], "room": n + 3, "iterations": 0} for n in (4, 5, 6, 7)},
 }
 SEEDS = 5

@@ -72,8 +72,8 @@ def group_advantages(rewards, group_size, baseline="mean", scale="group", eps=1e
       rewards: of P groups one after the other; (P G,).
       group_size: G ≥ 2.
       baseline: "mean" of the group, or "leave_one_out", the mean of its other members.
-      scale: divide by the standard deviation of the rewards of each "group", or of the
-        whole "batch", each plus eps; or by nothing, "none".
+      scale: divide by the standard deviation (over G or over G - 1) of the rewards of each
+        "group", or of the whole "batch", each plus eps; or by nothing, "none".
       eps: ε > 0, in units of reward.
 
     Returns: (P G,) advantages without a graph; 0 in a group of equal rewards.
@@ -196,9 +196,9 @@ def grpo_loss(
       beta: β ≥ 0, price of a nat; 0 leaves the divergence out.
       how, max_length: of aggregate_loss.
 
-    Returns: (loss, metrics): a scalar (0-dim) tensor, and a dict of detached 0-dim tensors,
-      clipped_low and clipped_high, the shares of kept tokens whose gradient each bound
-      takes away (ρ below 1 - ε_low where A < 0, above 1 + ε_high where A > 0).
+    Returns: (loss, metrics): a scalar (0-dim) tensor, and a dict of detached 0-dim tensors
+      of its dtype, clipped_low and clipped_high, the shares of kept tokens whose gradient
+      each bound takes away (ρ below 1 - ε_low where A < 0, above 1 + ε_high where A > 0).
     Raises: ValueError that names an argument if shapes differ, clip_low, clip_high or beta
       is below 0, or beta > 0 without ref_logps.
     """

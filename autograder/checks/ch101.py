@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace as changed
 from itertools import combinations, pairwise
+from typing import Any
 
 import torch
 
@@ -291,6 +292,12 @@ def _groups(generator, groups=5, size=4, binary=False, **settings):
     return {"rewards": rewards, "group_size": size, **settings}
 
 
+@drawing
+def _priced(generator, groups=5, size=4, all_wrong=False, **settings):
+    right = integers(generator, 0, 2, groups * size).double() * (0 if all_wrong else 1)
+    return {"rewards": right - 1e-3 * integers(generator, 0, 8, groups * size).double(), "group_size": size, **settings}
+
+
 def _alike(generator):
     return {"rewards": uniform(generator, 4).repeat_interleave(3), "group_size": 3, "eps": 1e-3}
 
@@ -334,10 +341,11 @@ def _advantages(
     return formula
 
 
+_CORRECTED: dict[str, Any] = {"own": lambda r, e: r.std(1, keepdim=True) + e, "whole": lambda r, e: r.std() + e}
+
+
 def _unbiased(rewards, group_size, baseline="mean", scale="group", eps=1e-6):
-    return _grouped(_advantages(own=lambda r, e: r.std(1, keepdim=True) + e, whole=lambda r, e: r.std() + e))(
-        rewards, group_size, baseline, scale, eps
-    )
+    return _grouped(_advantages(**_CORRECTED))(rewards, group_size, baseline, scale, eps)
 
 
 def _inside(rewards, group_size, baseline="mean", scale="group", eps=1e-6):
@@ -383,10 +391,11 @@ GROUP_ADVANTAGES = Exercise(
         ),
         Case("groups of two", _groups(4, 2, baseline="leave_one_out", scale="none"), closed_form=_row_by_row),
         Case("a large eps", _groups(eps=0.5)),
+        Case("rewards that differ by thousandths", _priced(all_wrong=True), visible=True),
         Case("rewards that require gradient", _groups(scale="none"), differentiate=["rewards"], visible=True),
         Case("single precision", _groups(scale="none"), dtype=torch.float32, visible=True),
         refused(_groups(), group_size=1, visible=True),
-        refused(_groups(), group_size=3),
+        Case("rewards that are no whole groups", _groups(group_size=3), raises=["group_size", "rewards"], visible=True),
         refused(_groups(), baseline="median", visible=True),
         refused(_groups(), scale="std", visible=True),
     ),
@@ -397,8 +406,16 @@ GROUP_ADVANTAGES = Exercise(
                     _advantages(fold=lambda r, g: r.reshape(g, -1).T, unfold=lambda a: a.T.flatten()),
                     "Groups are contiguous, but here every P-th answer is put into one group: reshape(-1, group_size).",
                 ),
+                "groups-interleaved-unbiased": (
+                    _advantages(fold=lambda r, g: r.reshape(g, -1).T, unfold=lambda a: a.T.flatten(), **_CORRECTED),
+                    "Groups are contiguous, but here every P-th answer is put into one group: reshape(-1, group_size).",
+                ),
                 "whole-batch-centred": (
                     _advantages(centre=lambda r, g: r.mean()),
+                    "The baseline is the mean of the whole batch: a hard prompt's right answer is compared with easy prompts.",
+                ),
+                "whole-batch-centred-unbiased": (
+                    _advantages(centre=lambda r, g: r.mean(), **_CORRECTED),
                     "The baseline is the mean of the whole batch: a hard prompt's right answer is compared with easy prompts.",
                 ),
                 "not-centred": (_advantages(centre=lambda r, g: 0), "No baseline is subtracted."),
@@ -406,8 +423,16 @@ GROUP_ADVANTAGES = Exercise(
                     _advantages(leave=lambda g: 1),
                     "The mean of the others leaves the answer's own reward out.",
                 ),
+                "leave-one-out-ignored-unbiased": (
+                    _advantages(leave=lambda g: 1, **_CORRECTED),
+                    "The mean of the others leaves the answer's own reward out.",
+                ),
                 "leave-one-out-inverted": (
                     _advantages(leave=lambda g: (g - 1) / g),
+                    "Leaving itself out makes an advantage larger, by G / (G - 1), not smaller.",
+                ),
+                "leave-one-out-inverted-unbiased": (
+                    _advantages(leave=lambda g: (g - 1) / g, **_CORRECTED),
                     "Leaving itself out makes an advantage larger, by G / (G - 1), not smaller.",
                 ),
                 "sum-of-others": (
@@ -435,6 +460,13 @@ GROUP_ADVANTAGES = Exercise(
                         own=lambda r, e: r.var(1, keepdim=True, correction=0) + e, whole=lambda r, e: r.var(correction=0) + e
                     ),
                     "The variance divides where its root should: advantages would have the unit 1 / reward.",
+                ),
+                "floor-for-eps": (
+                    _advantages(
+                        own=lambda r, e: r.std(1, keepdim=True, correction=0).clamp(min=0.1),
+                        whole=lambda r, e: r.std(correction=0).clamp(min=0.1),
+                    ),
+                    "The deviation gets a floor in the place of eps, so that small differences of reward are hardly scaled up.",
                 ),
                 "eps-forgotten": (
                     _advantages(own=lambda r, e: r.std(1, keepdim=True, correction=0), whole=lambda r, e: r.std(correction=0)),
@@ -541,6 +573,10 @@ AGGREGATE_LOSS = Exercise(
                     _aggregate(tokens=lambda x, m: x.mean(), sequences=lambda x, m: x.mean()),
                     "The sum is divided by the size of the tensor, padding included: the loss depends on the longest answer.",
                 ),
+                "how-ignored": (
+                    lambda x, m, how, n: _aggregate()(x, m, "tokens", n),
+                    "how is ignored: whatever it says, the mean over all tokens comes out.",
+                ),
                 "tokens-by-rows": (
                     _aggregate(tokens=lambda x, m: (x.sum(1) / m.sum(1)).mean()),
                     "With tokens every token of the batch weighs the same: this is the mean of row means.",
@@ -548,6 +584,10 @@ AGGREGATE_LOSS = Exercise(
                 "sequences-by-tokens": (
                     _aggregate(sequences=lambda x, m: x.sum() / m.sum()),
                     "With sequences every answer weighs the same: take each row's mean, then the mean of these.",
+                ),
+                "tokens-and-sequences-swapped": (
+                    _aggregate(tokens=lambda x, m: (x.sum(1) / m.sum(1)).mean(), sequences=lambda x, m: x.sum() / m.sum()),
+                    "tokens and sequences are exchanged: with tokens every token weighs the same, with sequences every answer.",
                 ),
                 "sequences-summed": (
                     _aggregate(sequences=lambda x, m: (x.sum(1) / m.sum(1)).sum()),
@@ -801,7 +841,7 @@ GRPO_LOSS = Exercise(
         Case("first step: all ratios are 1", altered(_updated(), lambda d: {"logps": d["old_logps"].clone()}), visible=True),
         Case("gradient", _updated(), differentiate=["logps", "old_logps", "advantages"], visible=True, draws=2),
         Case("gradient of the divergence", _WITH_REF, differentiate=["logps", "ref_logps"], visible=True),
-        Case("gradient where padding holds ±10,000", loud_padding(_updated(), *_UNPADDED), differentiate=["logps"]),
+        Case("gradient where padding holds ±10,000", loud_padding(_updated(), *_UNPADDED), differentiate=["logps"], visible=True),
         Case("the same with a divergence", loud_padding(_WITH_REF, *_UNPADDED, "ref_logps"), differentiate=["logps"]),
         Case("single precision", _updated(), dtype=torch.float32, visible=True),
         *shape_cases(_updated(), _LOSS_NAMES),
@@ -1010,7 +1050,7 @@ END = 4  # of the vocabulary 0, 1, 2, "=" and end
 
 
 @drawing
-def _practice(generator, answers=8, prompts=("0=", "1=", "2="), reward=None, certain=None, learning_rate=1.0, **settings):
+def _practice(generator, answers=8, prompts=("0=", "1=", "2="), reward=None, certain=None, learning_rate=2.0, **settings):
     """A table that answers three prompts at random, and a verifier. One minibatch for all, so that the order makes no difference."""
     table = 0.3 * normal(generator, 3, 3, END + 1).float()
     table[:, :, END - 1] = -9.0
@@ -1020,6 +1060,7 @@ def _practice(generator, answers=8, prompts=("0=", "1=", "2="), reward=None, cer
     chosen = {
         "prompts": len(prompts),
         "group_size": answers,
+        "scale": "none",
         "new_tokens": 4,
         "minibatch": 500,
         "max_grad_norm": 100.0,
@@ -1045,6 +1086,7 @@ def _iterating(
     old=lambda old, new: old,
     parts=lambda n, s, generator: ch45.minibatches(n, s.minibatch, generator),
     silent=lambda r, s: (r.reshape(-1, s.group_size).std(1) == 0).float().mean().item(),
+    longest=lambda s, kept: s.new_tokens,
     sign=1,
     **fixed,
 ):
@@ -1063,7 +1105,7 @@ def _iterating(
             for rows in parts(len(asked), s, generator):
                 now = ch95.per_token_logps(policy.logits(ids[rows], attention[rows]), ids[rows])
                 given = (now, old(before[rows], now.detach()), weights[rows], kept[rows], s.clip_low, s.clip_high)
-                loss, told = ch101.grpo_loss(*given, how=s.how, max_length=s.new_tokens)
+                loss, told = ch101.grpo_loss(*given, how=s.how, max_length=longest(s, kept))
                 policy.step(sign * loss, s.max_grad_norm)
                 shares.append([told["clipped_low"].item(), told["clipped_high"].item()])
         low, high = (sum(column) / len(shares) for column in zip(*shares, strict=True))
@@ -1081,17 +1123,24 @@ GRPO_ITERATION = Exercise(
     reference=ch101.grpo_iteration,
     criteria={"values": 3.0},
     cases=(
-        _case("what it learns in thirty iterations", _practice(learning_rate=2.0), repeat=30, **_LEARNS, visible=True, draws=2),
+        _case("what it learns in thirty iterations", _practice(learning_rate=4.0), repeat=30, **_LEARNS, visible=True, draws=2),
         _case("the policy after one iteration", _practice(16), **_TABLE, visible=True, draws=2),
-        _case("centred only, one mean for all tokens", _practice(16, scale="none", how="constant"), **_TABLE, visible=True),
+        _case("one divisor for all tokens", _practice(16, how="constant"), **_TABLE, visible=True),
         _case(
             "leave one out, sequences",
-            _practice(6, baseline="leave_one_out", how="sequences", learning_rate=3.0),
+            _practice(6, baseline="leave_one_out", how="sequences", learning_rate=6.0),
             **_TABLE,
             draws=4,
         ),
         _case("narrow bounds, many passes", _practice(16, clip_low=0.02, clip_high=0.05, epochs=6), **_TABLE),
-        _case("a short gradient", _practice(16, max_grad_norm=0.003), **_TABLE, draws=3),
+        # whichever deviation divides, a gradient that is cut to one length keeps only its direction
+        _case(
+            "scaled by the group, a short gradient",
+            _practice(16, scale="group", max_grad_norm=0.003),
+            **_TABLE,
+            visible=True,
+            draws=3,
+        ),
         _case("equal rewards: nothing changes", _practice(reward=1.0), **_TABLE, visible=True),
         _case("what is told of an ordinary iteration", _practice(16, clip_low=0.02, clip_high=0.05, epochs=4), visible=True),
         _case("what is told where two prompts are always right", _practice(certain=(0, 1, 0)), visible=True),
@@ -1116,6 +1165,11 @@ GRPO_ITERATION = Exercise(
                 "The rewards go into the loss as they are: compare within groups.",
             ),
             "scale-fixed": (_iterating(scale="group"), "scale is group whatever the settings say."),
+            "scale-fixed-unbiased": (
+                _iterating(advantages=lambda r, s: _unbiased(r, s.group_size, s.baseline)),
+                "scale is group whatever the settings say.",
+            ),
+            "never-scaled": (_iterating(scale="none"), "scale of the settings is not used: nothing is divided."),
             "baseline-fixed": (_iterating(baseline="mean"), "baseline is mean whatever the settings say."),
             "how-fixed": (_iterating(how="tokens"), "The loss is over tokens whatever settings.how says."),
             "bounds-fixed": (_iterating(clip_low=0.2, clip_high=0.28), "clip_low and clip_high of the settings are not used."),
@@ -1132,6 +1186,16 @@ GRPO_ITERATION = Exercise(
             "prompt-counted": (
                 _iterating(mask=lambda samples, end: samples.attention_mask[:, 1:]),
                 "The prompt's tokens are trained, too: the policy did not choose them.",
+            ),
+            "mask-shifted": (
+                _iterating(
+                    mask=lambda samples, end: ch95.completion_mask(samples.input_ids, samples.prompt_lengths, end)[:, :-1]
+                ),
+                "The mask is one column late: per_token_logps begins with the second token, so the mask's first column goes.",
+            ),
+            "longest-of-the-batch": (
+                _iterating(longest=lambda s, kept: kept.shape[1]),
+                "max_length is settings.new_tokens, what an answer may have, and not the width of this batch.",
             ),
             "end-dropped": (
                 _iterating(
@@ -1151,6 +1215,10 @@ GRPO_ITERATION = Exercise(
     ),
     variants={
         "parts by name": _iterating(),
+        "with the unbiased deviation": _iterating(
+            advantages=lambda r, s: _unbiased(r, s.group_size, s.baseline, s.scale),
+        ),
+        "with eps inside the root": _iterating(advantages=lambda r, s: _inside(r, s.group_size, s.baseline, s.scale)),
         "prompts repeated by index": _iterating(
             ask=lambda prompts, size: [prompts[i // size] for i in range(len(prompts) * size)]
         ),
@@ -1164,12 +1232,6 @@ GRPO_ITERATION = Exercise(
 )
 
 # ---------------------------------------------------------------------------------------------------- repaired_advantages
-
-
-@drawing
-def _priced(generator, groups=5, size=4, all_wrong=False):
-    right = integers(generator, 0, 2, groups * size).double() * (0 if all_wrong else 1)
-    return {"rewards": right - 1e-3 * integers(generator, 0, 8, groups * size).double(), "group_size": size}
 
 
 _repaired = versions_of(ch101.repaired_advantages, *_GROUP_RULES[:2], data=("rewards",))
@@ -1201,7 +1263,7 @@ REPAIRED_ADVANTAGES = Exercise(
         Case("rewards that require gradient", _priced(), differentiate=["rewards"], visible=True),
         Case("single precision", _priced(), dtype=torch.float32, visible=True, atol=1e-6),
         refused(_priced(), group_size=1, visible=True),
-        refused(_priced(), group_size=3),
+        Case("rewards that are no whole groups", _priced(size=4, group_size=3), raises=["group_size", "rewards"], visible=True),
     ),
     misconceptions=(
         *wrong(
@@ -1216,6 +1278,14 @@ REPAIRED_ADVANTAGES = Exercise(
                 ),
                 "divided-by-the-batch": (
                     _repair(lambda x: _c(x) / (x.std(correction=0) + 1e-6)),
+                    "One divisor for all groups repairs it, too, but then advantages are not in units of reward, as is asked.",
+                ),
+                "divided-by-the-group-unbiased": (
+                    _repair(lambda x: _c(x) / (x.std(1, keepdim=True) + 1e-6)),
+                    "This is the suspect's own line: in a group of wrong answers a thousandth of reward becomes a whole advantage.",
+                ),
+                "divided-by-the-batch-unbiased": (
+                    _repair(lambda x: _c(x) / (x.std() + 1e-6)),
                     "One divisor for all groups repairs it, too, but then advantages are not in units of reward, as is asked.",
                 ),
                 "sign-only": (
