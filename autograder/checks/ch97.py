@@ -763,7 +763,7 @@ def _stepping(
             logps = logps_of(policy, pairs.of(picked))
             ref_logps = ref_of(policy, reference, pairs, picked, logps)
             four = sides(logps, ref_logps)
-            return ch97.dpo_loss(*four, beta=given["beta"]), logps
+            return ch97.dpo_loss(four[0], four[1], four[2], four[3], given["beta"]), logps
 
         for picked in batches:
             if anew:
