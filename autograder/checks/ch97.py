@@ -670,10 +670,10 @@ def _epoch(generator, batches=((4, 0, 6), (2, 7, 1), (5, 3)), beta=0.5, moved=0.
         "completion_mask": attention_mask & ~given,
     }
     table = normal(generator, tokens, tokens)
-    policy = built("language.direct.Bigrams", table=table + moved * normal(generator, tokens, tokens), training=training)
+    policy = built("language.tables.Bigrams", table=table + moved * normal(generator, tokens, tokens), training=training)
     return {
         "policy": policy,
-        "reference": built("language.direct.Bigrams", table=table),
+        "reference": built("language.tables.Bigrams", table=table),
         "pairs": built("language.direct.Pairs", **texts),
         "batches": [torch.tensor(batch) for batch in batches],
     } | {"beta": beta, "learning_rate": 0.05, "max_grad_norm": 100.0, **settings}

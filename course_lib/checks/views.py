@@ -240,3 +240,25 @@ def weights_learned(_arguments: Mapping[str, Any], outputs: Mapping[str, np.ndar
     if "weights" not in outputs:
         raise ValueError("there are no weights")
     return {"weights": outputs["weights"]}
+
+
+def habits_of_a_table(arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What the policy of a language.tables.TableActor writes after training, beside its reference.
+
+    Args:
+      arguments: reference and score, as they were built.
+      outputs: "policy.table" (V, V).
+
+    Returns: truth values: whether the token that the score counts follows most others more often than not, and whether on average over
+      tokens the divergence from the reference is below 0.05 nats.
+    """
+    if "policy.table" not in outputs:
+        raise ValueError("there is no policy's table")
+    tables = (outputs["policy.table"], np.asarray(arguments["reference"]["arguments"]["table"]))
+    ours, theirs = (torch.as_tensor(table).double()[:-1].log_softmax(-1) for table in tables)
+    liked = ours[:, arguments["score"]["arguments"]["token"]].exp()
+    divergence = (ours.exp() * (ours - theirs)).sum(1).mean()
+    return {
+        "the liked token is written": np.asarray(bool(liked.median() > 0.5)),
+        "stays near the reference": np.asarray(bool(divergence < 0.05)),
+    }

@@ -34,28 +34,6 @@ class Pairs(NamedTuple):
         return Pairs(*(part[rows, :, :longest] for part in self))
 
 
-class Bigrams(torch.nn.Module):
-    """A policy for trying out a training loop in milliseconds: the next token depends on the one before it alone.
-
-    In training mode it drops the logits of every other token, as dropout would, but always of the same ones; it begins in eval mode.
-
-    Args:
-      table: logits of the next token (columns) behind each token (rows); (V, V).
-      training: whether it begins in training mode.
-    """
-
-    def __init__(self, table: torch.Tensor, training: bool = False):
-        super().__init__()
-        self.table = torch.nn.Parameter(table)
-        self.train(training)
-
-    def logits(self, input_ids: torch.Tensor, attention_mask: torch.Tensor) -> torch.Tensor:
-        """(B, L, V); what they are at padding means nothing."""
-        kept = torch.arange(len(self.table)) % 2 == 0
-        table = torch.where(kept, 2 * self.table, 0) if self.training else self.table
-        return table[input_ids]
-
-
 def encode_pairs(model: LanguageModel, chosen: Sequence[str], rejected: Sequence[str], prompts: Sequence[str] = ()) -> Pairs:
     """Pairs of completions as tokens, each with the end token behind it.
 

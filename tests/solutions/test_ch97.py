@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from course_lib.language import direct, lm
+from course_lib.language import direct, lm, tables
 from solutions.ch97 import dpo_epoch, dpo_loss, ipo_loss, kl_optimal_policy, repaired_completion_mask, sequence_logps
 
 
@@ -184,7 +184,7 @@ def two_words(*pairs):
 
 
 def test_an_epoch_makes_the_chosen_likelier_and_leaves_the_reference_alone():
-    policy, reference = (direct.Bigrams(torch.zeros(4, 4, dtype=torch.float64)) for _ in range(2))
+    policy, reference = (tables.Bigrams(torch.zeros(4, 4, dtype=torch.float64)) for _ in range(2))
     log = dpo_epoch(policy, reference, two_words((1, 2), (1, 3)), [torch.tensor([0]), torch.tensor([1])] * 5, 1.0, 0.1)
     probabilities = policy.table[0].softmax(-1)
     assert probabilities[1] > 0.25 > probabilities[2] and not reference.table.any()
@@ -207,7 +207,7 @@ def test_an_epoch_on_a_language_model_makes_the_steps_of_the_library():
 
 
 def test_an_epoch_without_a_price_is_refused():
-    policy = direct.Bigrams(torch.zeros(3, 3))
+    policy = tables.Bigrams(torch.zeros(3, 3))
     with pytest.raises(ValueError, match="beta must be above 0, got 0"):
         dpo_epoch(policy, policy, two_words((1, 2)), [torch.tensor([0])], beta=0)
 

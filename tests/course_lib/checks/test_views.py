@@ -175,3 +175,18 @@ def test_without_a_diary_or_weights_nothing_is_seen():
             views.diary_of_training(TRAINING, outputs)
     with pytest.raises(ValueError, match="no weights"):
         views.weights_learned({}, {"diary": np.zeros(3)})
+
+
+def test_habits_of_a_table():
+    table = np.zeros((4, 4))
+    arguments = {"reference": {"arguments": {"table": table}}, "score": {"arguments": {"token": 1}}}
+
+    def habits(changed):
+        return [bool(seen) for seen in views.habits_of_a_table(arguments, {"policy.table": changed}).values()]
+
+    liking, nearly = table.copy(), table.copy()
+    liking[:, 1] += 3
+    nearly[:, 1] += 0.1
+    assert (habits(liking), habits(nearly), habits(-liking)) == ([True, False], [False, True], [False, False])
+    with pytest.raises(ValueError, match="no policy's table"):
+        views.habits_of_a_table(arguments, {})
