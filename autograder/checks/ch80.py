@@ -1069,7 +1069,7 @@ FIT_REWARD_MODEL = Exercise(
     criteria={"values": 2.3, "gradient": 0.1, "errors": 0.1},
     cases=(
         Case("the weights, all pairs in one minibatch", _compared(), **_FITTED, visible=True, draws=1),
-        Case("the held-out losses", _compared(), visible=True, draws=1),
+        Case("the held-out losses", _compared(), view="losses_seen", visible=True, draws=1),
         Case(
             "three minibatches of pairs that are all alike",
             _compared(epochs=3, batch_size=2, alike=True),
@@ -1099,7 +1099,8 @@ FIT_REWARD_MODEL = Exercise(
                 torch.stack([scorer(side) for side in both], 1), torch.zeros(len(both[0]), dtype=torch.int64)
             )
         ),
-        "all weights kept, the best looked up": _fitting(
+        "all weights kept, losses as numbers": _fitting(
+            told=lambda losses: torch.tensor([loss.item() for loss in losses]),
             keep=lambda scorer: {name: part.clone() for name, part in scorer.state_dict().items()},
             pick=lambda losses: int(torch.stack(losses).argmin()),
         ),

@@ -813,7 +813,7 @@ def _two_passes(policy, reference, pairs, batches, beta=0.1, learning_rate=2e-4,
         optimizer.step()
         for name, value in _means(losses, chosen, rejected).items():
             log[name].append(value.item())
-    return {name: torch.tensor(values, dtype=torch.float64) for name, values in log.items()}
+    return {name: torch.tensor(values) for name, values in log.items()}
 
 
 def _as_they_come(batches):
@@ -944,8 +944,8 @@ DPO_EPOCH = Exercise(
     criteria={"values": 2.3, "gradient": 0.1, "errors": 0.1},
     cases=drawn_once(
         Case("both models after an epoch", _epoch(), **_LEARNED, visible=True, draws=2),
-        Case("what is logged of it", _epoch(), visible=True),
-        Case("a policy that is its reference", _epoch(moved=0.0), visible=True),
+        Case("what is logged of it", _epoch(), view="log_of_steps", visible=True),
+        Case("a policy that is its reference", _epoch(moved=0.0), view="log_of_steps", visible=True),
         Case("a long gradient", _epoch(max_grad_norm=0.01), **_LEARNED, visible=True, draws=2),
         Case("another price, and small steps", _epoch(beta=2.0, learning_rate=0.003), **_LEARNED),
         Case("batches that share a pair, and leave others out", _epoch(((1, 2), (2,), (2, 5, 1))), **_LEARNED),

@@ -262,3 +262,18 @@ def habits_of_a_table(arguments: Mapping[str, Any], outputs: Mapping[str, np.nda
         "the liked token is written": np.asarray(bool(liked.median() > 0.5)),
         "stays near the reference": np.asarray(bool(divergence < 0.05)),
     }
+
+
+def losses_seen(_arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """A tensor of losses in double precision, whatever its own."""
+    losses = outputs.get("")
+    if losses is None or losses.ndim != 1 or losses.dtype.kind != "f":
+        raise ValueError("the losses must be one tensor of numbers, (entries,)")
+    return {"losses": losses.astype(np.float64)}
+
+
+def log_of_steps(_arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """A dict of tensors with an entry for each step, in double precision, whatever their own."""
+    if not outputs or any("." in name or column.ndim != 1 or column.dtype.kind != "f" for name, column in outputs.items()):
+        raise ValueError("the log must be a dict of tensors, (steps,) each")
+    return {name: column.astype(np.float64) for name, column in outputs.items()}

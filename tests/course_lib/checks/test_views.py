@@ -190,3 +190,21 @@ def test_habits_of_a_table():
     assert (habits(liking), habits(nearly), habits(-liking)) == ([True, False], [False, True], [False, False])
     with pytest.raises(ValueError, match="no policy's table"):
         views.habits_of_a_table(arguments, {})
+
+
+def test_losses_and_logs_are_seen_in_double_precision():
+    column = np.ones(3, dtype=np.float32)
+    assert views.losses_seen({}, {"": column})["losses"].dtype == np.float64
+    assert views.log_of_steps({}, {"loss": column, "accuracy": column})["accuracy"].dtype == np.float64
+
+
+@pytest.mark.parametrize("outputs", [{}, {"0": np.ones(())}, {"": np.ones(())}, {"": np.ones(3, dtype=int)}])
+def test_what_is_no_tensor_of_losses_is_refused(outputs):
+    with pytest.raises(ValueError, match="one tensor of numbers"):
+        views.losses_seen({}, outputs)
+
+
+@pytest.mark.parametrize("outputs", [{}, {"0.loss": np.ones(3)}, {"loss": np.ones(())}, {"loss": np.ones(3, dtype=int)}])
+def test_what_is_no_log_is_refused(outputs):
+    with pytest.raises(ValueError, match="dict of tensors"):
+        views.log_of_steps({}, outputs)
