@@ -274,6 +274,6 @@ def losses_seen(_arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]
 
 def log_of_steps(_arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """A dict of tensors with an entry for each step, in double precision, whatever their own."""
-    if not outputs or any("." in name or column.ndim != 1 or column.dtype.kind != "f" for name, column in outputs.items()):
+    if not outputs or any("." in name or column.dtype.kind != "f" for name, column in outputs.items()):
         raise ValueError("the log must be a dict of tensors, (steps,) each")
     return {name: column.astype(np.float64) for name, column in outputs.items()}

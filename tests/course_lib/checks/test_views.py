@@ -204,7 +204,7 @@ def test_what_is_no_tensor_of_losses_is_refused(outputs):
         views.losses_seen({}, outputs)
 
 
-@pytest.mark.parametrize("outputs", [{}, {"0.loss": np.ones(3)}, {"loss": np.ones(())}, {"loss": np.ones(3, dtype=int)}])
+@pytest.mark.parametrize("outputs", [{}, {"0.loss": np.ones(3)}, {"loss": np.ones(3, dtype=int)}])
 def test_what_is_no_log_is_refused(outputs):
     with pytest.raises(ValueError, match="dict of tensors"):
         views.log_of_steps({}, outputs)
