@@ -138,9 +138,12 @@ def fit_reward_model(
 
     Each epoch goes through all training pairs once, in a fresh random order, batch_size of
     them at a time; a last minibatch that is smaller counts, too. For each minibatch comes one
-    step down its bradley_terry_loss. Before training, and after every epoch, the loss of all
-    held-out pairs together is written down. Early stopping as in Goodfellow et al. (2016),
-    section 7.8, https://www.deeplearningbook.org, but without stopping.
+    step down its bradley_terry_loss,
+
+        -mean(log sigmoid(R_chosen - R_rejected)),   R = scorer(clips)
+
+    Before training, and after every epoch, the loss of all held-out pairs together is written
+    down. Goodfellow et al. (2016), section 7.8, https://www.deeplearningbook.org
 
     Args:
       scorer: torch.nn.Module, changed in place: B clips -> their learned returns, (B,).
