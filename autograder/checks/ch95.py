@@ -1194,8 +1194,8 @@ def _row_by_row(actor, reference, prompts, score, settings, generator):
 
 
 _BOTH: dict[str, Any] = {"returns": ("actor", "reference")}
-_HABITS: dict[str, Any] = {"repeat": 10, "returns": ("actor",), "view": "habits_of_a_table"}
-_LONG: dict[str, Any] = {"prompts": ("0", "21", "3", "02", "1", "30") * 4, "moved": 0.0, "gae_lambda": 1.0}
+_HABITS: dict[str, Any] = {"repeat": 5, "returns": ("actor",), "view": "habits_of_a_table"}
+_LONG: dict[str, Any] = {"prompts": ("0", "21", "3", "02", "1", "30") * 8, "moved": 0.0, "gae_lambda": 1.0}
 _iter = lambda name, inputs, **options: Case(name, inputs, **({"rtol": 1e-4, "atol": 1e-5, "draws": 1} | options))  # noqa: E731
 
 _WRONG_RLHF_ITERATION = {
@@ -1305,13 +1305,13 @@ RLHF_ITERATION = Exercise(
     reference=ch95.rlhf_iteration,
     criteria={"values": 3.0},
     cases=(
-        _iter("what ten iterations teach", _iteration(**_LONG, kl_coef=0.0, learning_rate=12.0), **_HABITS, visible=True),
-        _iter("what a high price holds", _iteration(**_LONG, kl_coef=5.0, learning_rate=2.0), **_HABITS, visible=True),
-        _iter("actor and reference after one iteration", _iteration(), **_BOTH, visible=True, draws=2),
+        _iter("what five iterations teach", _iteration(**_LONG, kl_coef=0.0, learning_rate=30.0), **_HABITS, visible=True),
+        _iter("what a high price holds", _iteration(**_LONG, kl_coef=8.0, learning_rate=3.0), **_HABITS, visible=True),
+        _iter("actor and reference after one iteration", _iteration(), **_BOTH, visible=True),
         _iter("a policy that is its reference", _iteration(moved=0.0), **_BOTH),
-        _iter("narrow bounds, many passes", _iteration(clip_range=0.02, epochs=5), **_BOTH, visible=True),
+        _iter("narrow bounds, many passes", _iteration(clip_range=0.02, epochs=4), **_BOTH, visible=True),
         _iter("a short gradient", _iteration(max_grad_norm=0.003), **_BOTH),
-        _iter("what is told", _iteration(clip_range=0.02, epochs=4), visible=True, draws=2),
+        _iter("what is told", _iteration(clip_range=0.02, epochs=3), visible=True),
         _iter("steps of small minibatches", _iteration(minibatch=4), returns=("actor",), view="steps_made", visible=True),
         _iter("what is drawn from", _iteration(), returns=("generator",), view="drawn_from"),
     ),
