@@ -1194,7 +1194,7 @@ def _row_by_row(actor, reference, prompts, score, settings, generator):
 
 
 _BOTH: dict[str, Any] = {"returns": ("actor", "reference")}
-_HABITS: dict[str, Any] = {"repeat": 5, "returns": ("actor",), "view": "habits_of_a_table"}
+_HABITS: dict[str, Any] = {"repeat": 6, "returns": ("actor",), "view": "habits_of_a_table"}
 _LONG: dict[str, Any] = {"prompts": ("0", "21", "3", "02", "1", "30") * 8, "moved": 0.0, "gae_lambda": 1.0}
 _iter = lambda name, inputs, **options: Case(name, inputs, **({"rtol": 1e-4, "atol": 1e-5, "draws": 1} | options))  # noqa: E731
 
@@ -1305,7 +1305,7 @@ RLHF_ITERATION = Exercise(
     reference=ch95.rlhf_iteration,
     criteria={"values": 3.0},
     cases=(
-        _iter("what five iterations teach", _iteration(**_LONG, kl_coef=0.0, learning_rate=30.0), **_HABITS, visible=True),
+        _iter("what it learns in six iterations", _iteration(**_LONG, kl_coef=0.0, learning_rate=30.0), **_HABITS, visible=True),
         _iter("what a high price holds", _iteration(**_LONG, kl_coef=8.0, learning_rate=3.0), **_HABITS, visible=True),
         _iter("actor and reference after one iteration", _iteration(), **_BOTH, visible=True),
         _iter("a policy that is its reference", _iteration(moved=0.0), **_BOTH),
