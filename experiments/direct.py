@@ -1,7 +1,8 @@
 """DPO on human ratings with the tiny language model: weights beta, other losses, an unfrozen reference, a silent bug (chapter 97).
 
 Every variant begins with the fine-tuned policy of the experiment rlhf and learns from some of the comparisons that the reward model there
-has, in one epoch; a run's seed is that of both. "own_texts" learns from that policy's own texts instead, as the reward model orders them.
+has, in one epoch; a run's seed is that of both. "own_texts" learns from that policy's own texts instead, as the reward model orders them;
+"own_texts_twice" from as many, of which the second half are written by the policy as it is by then.
 A row stands for five steps; in some of them texts of the policy as it is then are looked at. At the end it is judged on prompts and on
 rated texts that it has not seen.
 """
@@ -41,6 +42,7 @@ VARIANTS: dict[str, dict] = {
     "suspect": COMMON | {"padding_counts": True, "look": 10},
     "reward_model": COMMON | {"loss": "reward model"},
     "own_texts": COMMON | {"candidates": 4, "look": 10},
+    "own_texts_twice": COMMON | {"candidates": 4, "look": 10, "rounds": 2},
 }
 SEEDS = 5
 ROWS = 5  # steps that a row stands for
@@ -125,13 +127,19 @@ def rated(seed: int) -> tuple[Pairs, torch.Tensor]:
     return pairs, reference_logps(model, pairs, sequence_logps)
 
 
-def own_texts(count: int, candidates: int, seed: int) -> Pairs:
-    """Of each prompt's completions by the policy that training begins with, those that chapter 96's reward model likes best and least."""
-    model, proxy = reference(seed), Proxy(rlhf.reward_model(seed), last_token_scores)
-    generator = torch.Generator().manual_seed(40_000 + seed)
+def own_texts(count: int, candidates: int, seed: int, writer: lm.LanguageModel | None = None, first: int = 0) -> Pairs:
+    """Of each prompt's completions by `writer`, those that chapter 96's reward model likes best and least.
+
+    Args:
+      count: of the prompts, from the one with the number `first` on.
+      candidates: completions of each.
+      writer: the policy that training begins with, if none is given.
+    """
+    model, proxy = writer or reference(seed), Proxy(rlhf.reward_model(seed), last_token_scores)
+    generator = torch.Generator().manual_seed(40_000 + seed + 1000 * first)
     picked: list[list[torch.Tensor]] = []  # of each text, its own tokens and which of them are the completion's
-    for begin in range(0, count, PROMPTS_AT_A_TIME):
-        prompts = openings("policy")[begin : min(count, begin + PROMPTS_AT_A_TIME)]
+    for begin in range(first, first + count, PROMPTS_AT_A_TIME):
+        prompts = openings("policy")[begin : min(first + count, begin + PROMPTS_AT_A_TIME)]
         samples = model.generate(
             [prompt for prompt in prompts for _ in range(candidates)], rlhf.PPO.new_tokens, generator=generator
         )
@@ -180,7 +188,9 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
     padding_counts = choice.get("padding_counts", False)
     loss = LOSSES[choice["loss"]](**{key: choice[key] for key in ("beta", "label_smoothing") if key in choice})
     policy = reference(seed).frozen_copy().requires_grad_(True)
-    epoch, ref, seconds = prepared(choice["pairs"], choice["batch"], seed, padding_counts, choice.get("candidates", 0))
+    rounds, candidates = choice.get("rounds", 1), choice.get("candidates", 0)
+    size = choice["pairs"] // rounds
+    epoch, ref, seconds = prepared(size, choice["batch"], seed, padding_counts, candidates)
     unseen, unseen_ref = held_out(seed, padding_counts)
     optimizer = torch.optim.AdamW(policy.parameters(), lr=choice["learning_rate"], weight_decay=0.0, fused=True)
 
@@ -190,14 +200,22 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
 
     rows: list[dict] = []
     steps: list[dict] = []
-    for done, (part, ref_logps) in enumerate(zip(epoch, ref, strict=True), 1):
+    for number in range(rounds):
         begun = time.process_time()
-        steps.append(train_step(policy, optimizer, part, ref_logps, loss, sequence_logps))
+        if number:  # the policy as it is now writes; the reference remains
+            fresh = own_texts(size, candidates, seed, policy, first=number * size)
+            epoch = batches(fresh, choice["batch"], padding_counts, torch.Generator().manual_seed(seed + 1000 * number))
+            ref = answered(reference(seed), epoch)
         seconds += time.process_time() - begun
-        if done % ROWS == 0:
-            row = {column: float(np.mean([step[column] for step in steps[-ROWS:]])) for column in steps[0]} | {"step": done}
-            rows.append(row | (look() if "look" in choice and done % choice["look"] == 0 else {}))
-            report(done, len(epoch))
+        for part, ref_logps in zip(epoch, ref, strict=True):
+            begun = time.process_time()
+            steps.append(train_step(policy, optimizer, part, ref_logps, loss, sequence_logps))
+            seconds += time.process_time() - begun
+            done = len(steps)
+            if done % ROWS == 0:
+                row = {column: float(np.mean([step[column] for step in steps[-ROWS:]])) for column in steps[0]} | {"step": done}
+                rows.append(row | (look() if "look" in choice and done % choice["look"] == 0 else {}))
+                report(done, rounds * len(epoch))
     writing = written(policy, seed, MANY)
     pairs, ref_logps = rated(seed)
     moved = reference_logps(policy, pairs, sequence_logps) - ref_logps

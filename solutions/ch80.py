@@ -4,6 +4,8 @@ segments.
 
 from __future__ import annotations
 
+import copy
+
 import torch
 import torch.nn.functional as F
 
@@ -127,6 +129,59 @@ def standardize_rewards(rewards, mask, eps=1e-8):
     validate.same_shape(rewards=rewards, mask=mask)
     kept = rewards[mask]
     return ((rewards - kept.mean()) / (kept.std() + eps)).masked_fill(~mask, 0)
+
+
+def fit_reward_model(
+    scorer, training_pairs, held_out_pairs, num_epochs, batch_size, learning_rate, generator
+):
+    """Fit a reward model to comparisons, and keep the weights that foresee unseen ones best.
+
+    Each epoch goes through all training pairs once, in a fresh random order, batch_size of
+    them at a time; a last minibatch that is smaller counts, too. For each minibatch comes one
+    step down its bradley_terry_loss,
+
+        -mean(log sigmoid(R_chosen - R_rejected)),   R = scorer(clips)
+
+    Before training, and after every epoch, the loss of all held-out pairs together is written
+    down. Goodfellow et al. (2016), section 7.8, https://www.deeplearningbook.org
+
+    Args:
+      scorer: torch.nn.Module, changed in place: B clips -> their learned returns, (B,).
+        clips[rows] are the clips of an int64 tensor of indices.
+      training_pairs: (chosen, rejected), M clips each; the i-th of either make a pair.
+      held_out_pairs: (chosen, rejected) of other comparisons, from which nothing is learned.
+      num_epochs: >= 1.
+      batch_size: pairs of a minibatch, >= 1.
+      learning_rate: of one torch.optim.AdamW for the whole training, its other settings as
+        PyTorch sets them.
+      generator: torch.Generator of the orders, the only source of randomness.
+
+    Returns: (num_epochs + 1,) held-out losses in nats, without a graph; the first is that
+      before training. The scorer ends with the weights of the smallest, the earliest of
+      equal ones.
+    Raises: ValueError that names an argument if num_epochs < 1 or batch_size < 1.
+    """
+    validate.at_least_one(num_epochs=num_epochs, batch_size=batch_size)
+    optimizer = torch.optim.AdamW(scorer.parameters(), lr=learning_rate)
+
+    @torch.no_grad()
+    def unseen_loss():
+        return bradley_terry_loss(*map(scorer, held_out_pairs))
+
+    losses, best = [unseen_loss()], copy.deepcopy(scorer.state_dict())
+    for _ in range(num_epochs):
+        order = torch.randperm(len(training_pairs[0]), generator=generator)
+        for rows in order.split(batch_size):
+            loss = bradley_terry_loss(*(scorer(side[rows]) for side in training_pairs))
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        loss = unseen_loss()
+        if loss < min(losses):
+            best = copy.deepcopy(scorer.state_dict())
+        losses.append(loss)
+    scorer.load_state_dict(best)
+    return torch.stack(losses)
 
 
 def repaired_segment_returns(reward_model, obs, mask):

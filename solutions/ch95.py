@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from course_lib import validate
+from solutions.ch45 import minibatches
 
 
 def per_token_logps(logits, input_ids):
@@ -177,6 +178,73 @@ def ppo_token_loss(logps, old_logps, advantages, mask, clip_range=0.2):
     return -torch.minimum(
         ratio * weights, ratio.clamp(1 - clip_range, 1 + clip_range) * weights
     ).mean()
+
+
+def rlhf_iteration(actor, reference, prompts, score, settings, generator):
+    """One iteration of PPO on tokens: write, look, estimate, improve.
+
+    Every prompt is continued once, all in one call of generate. What the policy, the
+    reference, the critic and the score say of these texts is asked once, before the first
+    step. The advantages are whitened; the critic's targets are advantages plus values before
+    that. Then come settings.epochs passes over all texts in random minibatches; for each, one
+    step down
+
+        ppo_token_loss(...) + mean_{kept}((V - target)²)
+
+    Ziegler et al. (2019), section 2, https://arxiv.org/abs/1909.08593
+
+    Args:
+      actor: changed in place. actor.policy.generate(prompts, new_tokens, generator=generator)
+        gives samples: input_ids, attention_mask, prompt_lengths, texts.
+        actor.policy.logits(input_ids, attention_mask) gives (B, L, V), actor.policy.end_id is
+        the end token. actor.critic(features) gives (..., 1) for (..., D).
+        actor.step(loss, max_grad_norm) makes one step of policy and critic.
+      reference: never changed. reference.hidden(input_ids, attention_mask) gives (B, L, D),
+        what is known at each column, which is also what the critic reads before the next
+        token is chosen; reference.head(hidden) gives logits (B, L, V).
+      prompts: B strings.
+      score: samples -> (B,), what each text is worth.
+      settings: new_tokens, kl_coef, gamma, gae_lambda, clip_range, epochs, minibatch (texts
+        of a step), max_grad_norm.
+      generator: of all draws: the texts first, then the minibatches.
+
+    Returns: dict of floats about the texts: score and tokens, means over them; kl, the mean of
+      a text's log-ratio to the reference, in nats; and clip_fraction, the share of kept tokens
+      whose ratio is further than clip_range from 1, a mean over the minibatches.
+    """
+    policy = actor.policy
+    samples = policy.generate(prompts, settings.new_tokens, generator=generator)
+    input_ids, attention_mask = samples.input_ids, samples.attention_mask
+    # (B, L) to (B, L - 1): column t is about the choice of token t + 1
+    mask = completion_mask(input_ids, samples.prompt_lengths, policy.end_id)[:, 1:]
+    with torch.no_grad():
+        old_logps = per_token_logps(policy.logits(input_ids, attention_mask), input_ids)
+        hidden = reference.hidden(input_ids, attention_mask)
+        ref_logps = per_token_logps(reference.head(hidden), input_ids)
+        features = hidden[:, :-1]
+        values = actor.critic(features).squeeze(-1)
+    scores = score(samples)
+    rewards = kl_penalized_rewards(scores, old_logps, ref_logps, mask, settings.kl_coef)
+    advantages = masked_gae(rewards, values, mask, settings.gamma, settings.gae_lambda)
+    returns = advantages + values
+    advantages = masked_whiten(advantages, mask)
+    fractions = []
+    for _ in range(settings.epochs):
+        for rows in minibatches(len(input_ids), settings.minibatch, generator):
+            kept, old = mask[rows], old_logps[rows]
+            logits = policy.logits(input_ids[rows], attention_mask[rows])
+            logps = per_token_logps(logits, input_ids[rows])
+            loss = ppo_token_loss(logps, old, advantages[rows], kept, settings.clip_range)
+            errors = actor.critic(features[rows]).squeeze(-1) - returns[rows]
+            actor.step(loss + masked_mean(errors**2, kept), settings.max_grad_norm)
+            outside = (logps.detach() - old).expm1().abs() > settings.clip_range
+            fractions.append(masked_mean(outside.to(logps.dtype), kept).item())
+    return {
+        "score": scores.mean().item(),
+        "kl": torch.where(mask, old_logps - ref_logps, 0).sum(1).mean().item(),
+        "tokens": mask.sum(1).float().mean().item(),
+        "clip_fraction": sum(fractions) / len(fractions),
+    }
 
 
 def repaired_reward_scaling(rewards, mask, eps=1e-8):

@@ -131,6 +131,59 @@ def kl_optimal_policy(ref_probs, rewards, beta):
     return (ref_probs.log() + rewards / beta).softmax(-1)
 
 
+def dpo_epoch(
+    policy, reference, pairs, batches, beta=0.1, learning_rate=2e-4, max_grad_norm=1.0
+):
+    """One epoch of direct preference optimisation: a step for each batch of pairs.
+
+    Each step goes down the mean of dpo_loss over its batch, without label smoothing, by one
+    torch.optim.AdamW for all steps, without weight decay; a gradient whose norm over all of
+    the policy's parameters is larger than max_grad_norm is shortened to that first.
+    Rafailov et al. (2023), eq. 7, https://arxiv.org/abs/2305.18290
+
+    Args:
+      policy: torch.nn.Module, changed in place, and left in the mode (train or eval) that it
+        is in: policy.logits(input_ids, attention_mask) gives (B, L, V) for (B, L) each.
+      reference: a module like it; never changed.
+      pairs: input_ids, attention_mask and completion_mask of M pairs, (M, 2, L) each, the
+        chosen text first. pairs.of(rows) has the same three for the pairs of an int64 tensor
+        of indices, without the columns that are padding in all of them.
+      batches: an iterable of such tensors, gone through once, in its order.
+      beta: β > 0.
+      learning_rate: of AdamW.
+      max_grad_norm: > 0.
+
+    Returns: dict of (steps,) tensors without a graph: loss, and the means of accuracy (1 where
+      the chosen text has the larger implicit reward), chosen_rewards and rejected_rewards,
+      over each batch as it was before its step.
+    Raises: ValueError that names an argument if beta ≤ 0.
+    """
+    validate.positive(beta=beta)
+    optimizer = torch.optim.AdamW(policy.parameters(), lr=learning_rate, weight_decay=0.0)
+    rows = []
+    for picked in batches:
+        # (B, 2, L) to (2 B, L): chosen and rejected texts alternate
+        input_ids, attention_mask, mask = (part.flatten(0, 1) for part in pairs.of(picked))
+        logps = sequence_logps(policy.logits(input_ids, attention_mask), input_ids, mask)
+        with torch.no_grad():
+            ref_logits = reference.logits(input_ids, attention_mask)
+            ref_logps = sequence_logps(ref_logits, input_ids, mask)
+        sides = logps[0::2], logps[1::2], ref_logps[0::2], ref_logps[1::2]
+        losses, chosen_rewards, rejected_rewards = dpo_loss(*sides, beta)
+        loss = losses.mean()
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), max_grad_norm)
+        optimizer.step()
+        right = (chosen_rewards > rejected_rewards).to(logps.dtype)
+        rows.append([part.mean() for part in (loss, right, chosen_rewards, rejected_rewards)])
+    names = ("loss", "accuracy", "chosen_rewards", "rejected_rewards")
+    columns = zip(*rows, strict=True)
+    return {
+        name: torch.stack(column).detach() for name, column in zip(names, columns, strict=True)
+    }
+
+
 def repaired_completion_mask(attention_mask, prompt_tokens):
     """Which tokens of each text the suspect program of the bug lab should have counted.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any
 
@@ -23,6 +24,7 @@ from autograder.authoring.parts import (
     number,
     one_shape,
     python_float,
+    refused,
     reshaped,
     satisfies,
     uniform,
@@ -802,6 +804,309 @@ SIMULATE_PREFERENCES = Exercise(
     },
 )
 
+# ---------------------------------------------------------------------------------------------------- fit_reward_model
+
+
+@drawing
+def _compared(generator, pairs=6, held_out=(3, 1), epochs=7, batch_size=50, learning_rate=0.4, steps=4, alike=False):
+    """Comparisons of numbered clips: in training the clip that lies further along one direction is always chosen. In those held out it
+    is chosen `held_out[0]` times and rejected `held_out[1]` times, so that they are foreseen best by weights that are not too large.
+    Where all pairs are alike, their order makes no difference."""
+    direction = normal(generator, 3)
+    direction = direction / direction.norm()
+
+    def clips(first, count, sign, spread):
+        lengths = integers(generator, 2, steps + 1, count)
+        obs = spread * normal(generator, count, steps, 3)
+        if alike:
+            lengths, obs = lengths[:1].expand(count), obs[:1].repeat(count, 1, 1)
+        mask = _lengths_to_mask(lengths, steps)
+        obs += (sign.reshape(-1, 1) * direction / (2 * lengths[:, None]))[:, None]
+        numbers = first + 2 * torch.arange(count, dtype=torch.float64)
+        parts = {
+            "obs": obs,
+            "actions": numbers[:, None, None].expand(count, steps, 1).clone(),
+            "rewards": torch.zeros(count, steps),
+        }
+        return built("control.clips.Segments", **parts, mask=mask)
+
+    def sides(first, signs, spread):
+        return [clips(first + side, len(signs), way * signs, spread) for side, way in enumerate((1, -1))]
+
+    unseen = torch.tensor([1.0] * held_out[0] + [-1.0] * held_out[1], dtype=torch.float64)
+    return {
+        "scorer": built("control.clips.WatchedScorer", weights=0.05 * normal(generator, 3)),
+        "training_pairs": sides(0, torch.ones(pairs, dtype=torch.float64), 0.05),
+        "held_out_pairs": sides(2 * pairs, unseen, 0.0),
+        "num_epochs": epochs,
+        "batch_size": batch_size,
+        "learning_rate": learning_rate,
+        "generator": built("seeding.generator", seed=int(integers(generator, 0, 2**31, 1))),
+    }
+
+
+def _pair_loss(scorer, chosen, rejected):
+    return ch80.bradley_terry_loss(scorer(chosen), scorer(rejected))
+
+
+def _shuffled(pairs, size, generator):
+    """An epoch's minibatches: rows of the chosen and of the rejected clips."""
+    order = torch.randperm(pairs, generator=generator)
+    return [(rows, rows) for rows in order.split(size)]
+
+
+def _both_shuffled(pairs, size, generator):
+    orders = (torch.randperm(pairs, generator=generator).split(size) for _ in range(2))
+    return list(zip(*orders, strict=True))
+
+
+def _drawn_again(pairs, size, generator):
+    """Minibatches drawn with replacement; that a pair comes twice is made sure of."""
+    drawn = [rows for rows, _ in _shuffled(pairs, size, generator)]
+    drawn[-1] = drawn[0][: len(drawn[-1])]
+    return [(rows, rows) for rows in drawn]
+
+
+def _adamw(scorer, rate):
+    return torch.optim.AdamW(scorer.parameters(), lr=rate)
+
+
+def _smallest(losses):
+    return min(range(len(losses)), key=lambda epoch: losses[epoch])
+
+
+def _fitting(
+    loss=_pair_loss,
+    batches=_shuffled,
+    optimizer=_adamw,
+    anew="",
+    clear=True,
+    learned=lambda training, held_out: training,
+    looked_at=lambda training, held_out: held_out,
+    keep=lambda scorer: copy.deepcopy(scorer.state_dict()),
+    pick=_smallest,
+    trained=lambda scorer: scorer,
+    told=torch.stack,
+    graph=torch.no_grad,
+    checked=True,
+    epochs=None,
+):
+    """A version of the loop, from the places where it can go wrong."""
+
+    def version(scorer, training_pairs, held_out_pairs, num_epochs, batch_size, learning_rate, generator):
+        if checked and min(num_epochs, batch_size) < 1:
+            raise ValueError("num_epochs and batch_size must be at least 1")
+        scorer, batch_size = trained(scorer), max(batch_size, 1)
+        chosen, rejected = learned(training_pairs, held_out_pairs)
+        adam, losses, weights = optimizer(scorer, learning_rate), [], []
+
+        def look():
+            with graph():
+                losses.append(_pair_loss(scorer, *looked_at(training_pairs, held_out_pairs)))
+            weights.append(keep(scorer))
+
+        look()
+        for _ in range(num_epochs if epochs is None else epochs):
+            if anew == "epoch":
+                adam = optimizer(scorer, learning_rate)
+            for rows, others in batches(len(chosen), batch_size, generator):
+                if anew == "step":
+                    adam = optimizer(scorer, learning_rate)
+                value = loss(scorer, chosen[rows], rejected[others])
+                if clear:
+                    adam.zero_grad()
+                value.backward()
+                adam.step()
+            look()
+        scorer.load_state_dict(weights[pick(losses)])
+        return told(losses)
+
+    return version
+
+
+class _SomePairs:
+    """Clips of two sets, one behind the other."""
+
+    def __init__(self, *parts):
+        self.parts = parts
+
+    def __len__(self):
+        return sum(map(len, self.parts))
+
+    def __getitem__(self, rows):
+        from course_lib.control.clips import Segments
+
+        names = ("obs", "actions", "rewards", "mask")
+        return Segments(*(torch.cat([getattr(part, name) for part in self.parts])[rows] for name in names))
+
+
+def _flat_loop(scorer, training_pairs, held_out_pairs, num_epochs, batch_size, learning_rate, generator):
+    """A variant: one loop over all steps, slices of an order, the best weights as tensors of parameters."""
+    if num_epochs < 1 or batch_size < 1:
+        raise ValueError(f"num_epochs and batch_size must be at least 1, got {num_epochs}, {batch_size}")
+    optimizer = torch.optim.AdamW(scorer.parameters(), lr=learning_rate)
+    (chosen, rejected), held_out = training_pairs, held_out_pairs
+    pairs, order, place = len(chosen), torch.arange(0), 0
+    with torch.no_grad():
+        losses = [F.softplus(scorer(held_out[1]) - scorer(held_out[0])).mean().item()]
+    best = [parameter.detach().clone() for parameter in scorer.parameters()]
+    while len(losses) <= num_epochs:
+        if place >= len(order):
+            order, place = torch.randperm(pairs, generator=generator), 0
+        rows = order[place : place + batch_size]
+        optimizer.zero_grad(set_to_none=False)
+        F.softplus(scorer(rejected[rows]) - scorer(chosen[rows])).mean().backward()
+        optimizer.step()
+        place += batch_size
+        if place >= pairs:
+            with torch.inference_mode():
+                losses.append(F.softplus(scorer(held_out[1]) - scorer(held_out[0])).mean().item())
+            if losses[-1] < min(losses[:-1]):
+                best = [parameter.detach().clone() for parameter in scorer.parameters()]
+    with torch.no_grad():
+        for parameter, kept in zip(scorer.parameters(), best, strict=True):
+            parameter.copy_(kept)
+    return torch.tensor(losses, dtype=torch.float64)
+
+
+_FITTED: dict[str, Any] = {"returns": ("scorer",), "view": "weights_learned"}
+_DIARY: dict[str, Any] = {"returns": ("scorer",), "view": "diary_of_training"}
+_SMALL = {"pairs": 7, "batch_size": 3, "epochs": 4}
+
+_WRONG_FIT_REWARD_MODEL = {
+    "gradient-never-cleared": (
+        _fitting(clear=False),
+        "backward() adds to the gradient that is there, so each step repeats all those before: optimizer.zero_grad() in front of it.",
+    ),
+    "one-step-an-epoch": (
+        _fitting(batches=lambda pairs, size, g: _shuffled(pairs, pairs, g)),
+        "There is one step in each epoch: clear, backward and step belong to each minibatch of batch_size pairs.",
+    ),
+    "optimizer-anew-each-step": (
+        _fitting(anew="step"),
+        "A new AdamW for each minibatch has forgotten its averages, and makes a step of full length in every coordinate: make it once.",
+    ),
+    "optimizer-anew-each-epoch": (
+        _fitting(anew="epoch"),
+        "AdamW is made anew in each epoch, without its averages: make it once.",
+    ),
+    "sides-exchanged": (
+        _fitting(loss=lambda scorer, chosen, rejected: _pair_loss(scorer, rejected, chosen)),
+        "It learns to prefer what was rejected: the chosen clips' returns come first in the loss.",
+    ),
+    "uphill": (
+        _fitting(loss=lambda *given: -_pair_loss(*given)),
+        "The loss is made large: it is the negative log-likelihood already, so go down its gradient.",
+    ),
+    "last-minibatch-dropped": (
+        _fitting(batches=lambda pairs, size, g: [two for two in _shuffled(pairs, size, g) if len(two[0]) == min(size, pairs)]),
+        "The last minibatch of an epoch is left out where it is smaller: its pairs count as well.",
+    ),
+    "first-minibatch-only": (
+        _fitting(batches=lambda *given: _shuffled(*given)[:1]),
+        "Each epoch ends after its first minibatch: a return or break is one level too deep.",
+    ),
+    "one-epoch-only": (_fitting(epochs=1), "There is one epoch: num_epochs says how many."),
+    "never-shuffled": (
+        _fitting(batches=lambda pairs, size, g: [(rows, rows) for rows in torch.arange(pairs).split(size)]),
+        "The pairs come in the order given: each epoch takes a fresh random one.",
+    ),
+    "one-order-for-all-epochs": (
+        _fitting(batches=lambda pairs, size, g: _shuffled(pairs, size, torch.Generator().manual_seed(5))),
+        "All epochs have one order, or it is not drawn from the generator that was handed in: draw a fresh one in each.",
+    ),
+    "drawn-with-replacement": (
+        _fitting(batches=_drawn_again),
+        "In an epoch some pairs come twice and others never: go through a permutation, not through independent draws.",
+    ),
+    "sides-shuffled-apart": (
+        _fitting(batches=_both_shuffled),
+        "Chosen and rejected clips are shuffled each for itself, so that clips meet that nobody has compared: use one order for both.",
+    ),
+    "held-out-trained-on": (
+        _fitting(learned=lambda training, held_out: [_SomePairs(*both) for both in zip(training, held_out, strict=True)]),
+        "The held-out pairs are learned from: their loss then says nothing about unseen ones.",
+    ),
+    "training-loss-watched": (
+        _fitting(looked_at=lambda training, held_out: training),
+        "The losses are those of the training pairs, which fall whatever is learned by heart: look at the held-out ones.",
+    ),
+    "weights-of-the-end": (
+        _fitting(keep=lambda scorer: scorer.state_dict()),
+        "The scorer ends with its last weights. If you did keep the best: state_dict() holds the tensors themselves, which later steps"
+        " overwrite. Copy it, as copy.deepcopy does.",
+    ),
+    "start-never-kept": (
+        _fitting(pick=lambda losses: 1 + _smallest(losses[1:])),
+        "The weights before training take part, too: where training only harms, the scorer ends as it came.",
+    ),
+    "worst-kept": (
+        _fitting(pick=lambda losses: max(range(len(losses)), key=lambda epoch: losses[epoch])),
+        "These are the weights with the *largest* held-out loss.",
+    ),
+    "first-loss-missing": (
+        _fitting(told=lambda losses: torch.stack(losses[1:])),
+        "The loss before training is missing: the result has num_epochs + 1 entries.",
+    ),
+    "best-loss-only": (_fitting(told=min), "This is the smallest loss: return all of them, one for each look."),
+    "copy-trained": (
+        _fitting(trained=copy.deepcopy),
+        "The scorer that was handed in has not changed: a copy was trained. Change it in place.",
+    ),
+    "no-weight-decay": (
+        _fitting(optimizer=lambda scorer, rate: torch.optim.Adam(scorer.parameters(), lr=rate)),
+        "Adam has no weight decay: torch.optim.AdamW is asked for.",
+    ),
+    "graph-kept": (
+        _fitting(graph=torch.enable_grad),
+        "The losses carry a graph each, and with it the whole scorer of that epoch: look under torch.no_grad().",
+    ),
+}
+
+FIT_REWARD_MODEL = Exercise(
+    name="fit_reward_model",
+    reference=ch80.fit_reward_model,
+    criteria={"values": 2.3, "gradient": 0.1, "errors": 0.1},
+    cases=(
+        Case("the weights, all pairs in one minibatch", _compared(), **_FITTED, visible=True, draws=1),
+        Case("the held-out losses", _compared(), view="losses_seen", visible=True, draws=1),
+        Case(
+            "three minibatches of pairs that are all alike",
+            _compared(epochs=3, batch_size=2, alike=True),
+            **_FITTED,
+            visible=True,
+        ),
+        Case("every epoch is better than the one before", _compared(epochs=2, learning_rate=0.1), **_FITTED, draws=1),
+        Case("held-out pairs that say the opposite: as it came", _compared(held_out=(1, 3)), **_FITTED, visible=True, draws=1),
+        Case("who is learned from, and when", _compared(**_SMALL), **_DIARY, visible=True, draws=1),
+        Case("minibatches of one pair", _compared(pairs=5, batch_size=1, epochs=2), **_DIARY, draws=1),
+        Case("minibatches that come out even", _compared(pairs=12, batch_size=4, epochs=3), **_DIARY, draws=1),
+        Case("what is drawn from", _compared(**_SMALL), returns=("generator",), view="drawn_from", draws=1),
+        refused(_compared(), num_epochs=0, visible=True),
+        refused(_compared(), batch_size=0),
+    ),
+    misconceptions=(
+        *wrong(_WRONG_FIT_REWARD_MODEL),
+        bad_input_accepted(
+            _fitting(checked=False), "num_epochs or batch_size of 0 asks for nothing: refuse it with a ValueError that names it."
+        ),
+    ),
+    variants={
+        "one loop over all steps": _flat_loop,
+        "the loop with its parts": _fitting(),
+        "cross-entropy of two logits": _fitting(
+            loss=lambda scorer, *both: F.cross_entropy(
+                torch.stack([scorer(side) for side in both], 1), torch.zeros(len(both[0]), dtype=torch.int64)
+            )
+        ),
+        "all weights kept, losses as numbers": _fitting(
+            told=lambda losses: torch.tensor([loss.item() for loss in losses]),
+            keep=lambda scorer: {name: part.clone() for name, part in scorer.state_dict().items()},
+            pick=lambda losses: int(torch.stack(losses).argmin()),
+        ),
+    },
+)
+
 # -------------------------------------------------------------------------------------- repaired_segment_returns
 
 _LAB = ("obs", "mask")
@@ -918,5 +1223,6 @@ EXERCISES = (
     BRADLEY_TERRY_LOSS,
     PREFERENCE_ACCURACY,
     STANDARDIZE_REWARDS,
+    FIT_REWARD_MODEL,
     REPAIRED_SEGMENT_RETURNS,
 )

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import statistics
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -33,7 +37,8 @@ from autograder.authoring.parts import (
     wrong,
 )
 from autograder.authoring.spec import Case, Exercise, Misconception
-from solutions import ch95
+from course_lib.checks.cases import built
+from solutions import ch45, ch95
 
 # ----------------------------------------------------------------------------------------------- masks, and what they keep
 
@@ -1028,6 +1033,301 @@ PPO_TOKEN_LOSS = Exercise(
     },
 )
 
+# ---------------------------------------------------------------------------------------------------------- rlhf_iteration
+
+_LIKED = 1  # the token that the score counts
+_TOKENS = 5  # of which the last one ends texts
+
+
+@drawing
+def _iteration(generator, prompts=("0", "21", "3", "02", "1", "30"), moved=0.4, learning_rate=0.5, **settings):
+    """Tables in place of networks, and prompts of unequal length. One minibatch for all texts, so that the order makes no difference."""
+    table = 0.4 * normal(generator, _TOKENS, _TOKENS)
+    chosen = {"kl_coef": 0.3, "new_tokens": 5, "epochs": 2, "minibatch": 500, "max_grad_norm": 100.0, "clip_range": 0.1}
+    return {
+        "actor": built(
+            "language.tables.TableActor",
+            table=table + moved * normal(generator, _TOKENS, _TOKENS),
+            weights=0.3 * normal(generator, 1, _TOKENS),
+            learning_rate=learning_rate,
+            critic_learning_rate=0.2,
+        ),
+        "reference": built("language.tables.Bigrams", table=table),
+        "prompts": list(prompts),
+        "score": built("language.tables.fondness", token=_LIKED),
+        "settings": built("language.fine_tuning.TokenPPO", **(chosen | {"gamma": 0.9, "gae_lambda": 0.7} | settings)),
+        "generator": built("seeding.generator", seed=int(integers(generator, 0, 2**31, 1))),
+    }
+
+
+def _written(samples, end):
+    return ch95.completion_mask(samples.input_ids, samples.prompt_lengths, end)[:, 1:]
+
+
+def _targets(advantages, values, mask):
+    """The advantages of the loss, and what the critic should have said."""
+    return ch95.masked_whiten(advantages, mask), advantages + values
+
+
+def _parts(count, settings, generator):
+    return ch45.minibatches(count, settings.minibatch, generator)
+
+
+def _told(scores, log_ratio, mask, fractions):
+    return {
+        "score": scores.mean().item(),
+        "kl": torch.where(mask, log_ratio, 0).sum(1).mean().item(),
+        "tokens": mask.sum(1).double().mean().item(),
+        "clip_fraction": statistics.fmean(fractions),
+    }
+
+
+def _of_policy(policy, samples):
+    return ch95.per_token_logps(policy.logits(samples.input_ids, samples.attention_mask), samples.input_ids)
+
+
+def _iterating(
+    mask=_written,
+    columns=slice(None, -1),
+    rewards=ch95.kl_penalized_rewards,
+    targets=_targets,
+    old=lambda old, ref, new: old,
+    parts: Callable[..., Any] = _parts,
+    value_loss=lambda errors, kept: ch95.masked_mean(errors**2, kept),
+    sign=1,
+    write=lambda policy, prompts, settings, generator: policy.generate(prompts, settings.new_tokens, generator=generator),
+    again=False,
+    renewed=False,
+    trained=lambda actor, reference: actor,
+    follow=False,
+    told=_told,
+    **fixed,
+):
+    """A version of the iteration, from the places where it can go wrong; `fixed` are settings of its own, whatever the caller's are."""
+
+    def version(actor, reference, prompts, score, settings, generator):
+        s = replace(settings, **fixed)
+        learner = trained(actor, reference)
+
+        def look():
+            with torch.no_grad():
+                old_logps, ref_logps = (_of_policy(model, samples) for model in (learner.policy, reference))
+                features = reference.hidden(samples.input_ids, samples.attention_mask)[:, columns]
+                values = learner.critic(features).squeeze(-1)
+            given = rewards(scores, old_logps, ref_logps, kept, s.kl_coef)
+            advantages = ch95.masked_gae(given, values, kept, s.gamma, s.gae_lambda)
+            return old_logps, ref_logps, features, *targets(advantages, values, kept)
+
+        samples = write(learner.policy, prompts, s, generator)
+        kept, scores, fractions = mask(samples, learner.policy.end_id), score(samples), []
+        old_logps, ref_logps, features, advantages, returns = look()
+        log_ratio = old_logps - ref_logps
+        first = scores, log_ratio, kept
+        for epoch in range(s.epochs):
+            if again and epoch:
+                samples = write(learner.policy, prompts, s, generator)
+                kept, scores = mask(samples, learner.policy.end_id), score(samples)
+            if (again or renewed) and epoch:
+                ratio_to, _, features, advantages, returns = look()
+                old_logps = ratio_to if again else old_logps
+            for rows in parts(len(prompts), s, generator):
+                logps = _of_policy(learner.policy, samples)[rows]
+                before = old(old_logps[rows], ref_logps[rows], logps.detach())
+                loss = ch95.ppo_token_loss(logps, before, advantages[rows], kept[rows], s.clip_range)
+                errors = learner.critic(features[rows]).squeeze(-1) - returns[rows]
+                learner.step(sign * loss + value_loss(errors, kept[rows]), s.max_grad_norm)
+                outside = ((logps.detach() - before).exp() - 1).abs() > s.clip_range
+                fractions.append(outside[kept[rows]].double().mean().item())
+        if follow:
+            reference.load_state_dict(actor.policy.state_dict())
+        return told(*first, fractions)
+
+    return version
+
+
+class _ReferenceAsActor:
+    """The reference in the policy's place."""
+
+    def __init__(self, actor, reference):
+        self.policy, self.critic, self.actor = reference, actor.critic, actor
+
+    def step(self, loss, max_grad_norm):
+        (gradient,) = torch.autograd.grad(loss, self.policy.table)
+        self.policy.table.data.sub_(self.actor.rates[0] * gradient)
+        self.actor.steps.add_(1)
+
+
+def _row_by_row(actor, reference, prompts, score, settings, generator):
+    """A variant: kept tokens flattened once, the loss by hand, slices of a permutation."""
+    samples = actor.policy.generate(prompts, settings.new_tokens, generator=generator)
+    ids, attention, count = samples.input_ids, samples.attention_mask, len(prompts)
+    mask = ch95.completion_mask(ids, samples.prompt_lengths, actor.policy.end_id)[:, 1:]
+    known = reference.hidden(ids, attention)[:, :-1].detach()
+    old = ch95.per_token_logps(actor.policy.logits(ids, attention), ids).detach()
+    ref = ch95.per_token_logps(reference.logits(ids, attention), ids).detach()
+    values = actor.critic(known)[..., 0].detach()
+    scores = score(samples)
+    rewards = ch95.kl_penalized_rewards(scores, old, ref, mask, settings.kl_coef)
+    advantages = ch95.masked_gae(rewards, values, mask, settings.gamma, settings.gae_lambda)
+    targets, weights = values + advantages, ch95.masked_whiten(advantages, mask)
+    clipped, steps = 0.0, 0
+    for _ in range(settings.epochs):
+        order = torch.randperm(count, generator=generator)
+        for start in range(0, count, settings.minibatch):
+            rows = order[start : start + settings.minibatch]
+            here = mask[rows]
+            logps = ch95.per_token_logps(actor.policy.logits(ids[rows], attention[rows]), ids[rows])[here]
+            ratio = (logps - old[rows][here]).exp()
+            bounded = ratio.clamp(1 - settings.clip_range, 1 + settings.clip_range)
+            gain = torch.minimum(ratio * weights[rows][here], bounded * weights[rows][here]).mean()
+            misses = actor.critic(known[rows][here])[:, 0] - targets[rows][here]
+            actor.step(misses.square().mean() - gain, settings.max_grad_norm)
+            clipped += float(((ratio - 1).abs() > settings.clip_range).double().mean())
+            steps += 1
+    per_text = ((old - ref) * mask).sum(1)
+    return {
+        "score": float(scores.mean()),
+        "kl": float(per_text.mean()),
+        "tokens": float(mask.sum() / count),
+        "clip_fraction": clipped / steps,
+    }
+
+
+_BOTH: dict[str, Any] = {"returns": ("actor", "reference")}
+_HABITS: dict[str, Any] = {"repeat": 6, "returns": ("actor",), "view": "habits_of_a_table"}
+_LONG: dict[str, Any] = {"prompts": ("0", "21", "3", "02", "1", "30") * 8, "moved": 0.0, "gae_lambda": 1.0}
+_iter = lambda name, inputs, **options: Case(name, inputs, **({"rtol": 1e-4, "atol": 1e-5, "draws": 1} | options))  # noqa: E731
+
+_WRONG_RLHF_ITERATION = {
+    "mask-not-shifted": (
+        _iterating(mask=lambda samples, end: ch95.completion_mask(samples.input_ids, samples.prompt_lengths, end)[:, :-1]),
+        "The mask is aligned with input_ids, log-probabilities begin with the second token: completion_mask(...)[:, 1:] goes with them.",
+    ),
+    "prompt-counted": (
+        _iterating(mask=lambda samples, end: samples.attention_mask[:, 1:]),
+        "The prompt's tokens are trained, too: the policy did not choose them. Use completion_mask.",
+    ),
+    "end-dropped": (
+        _iterating(mask=lambda samples, end: _written(samples, end) & (samples.input_ids[:, 1:] != end)),
+        "The end token is a choice: without its gradient the policy never learns when to stop.",
+    ),
+    "features-not-shifted": (
+        _iterating(columns=slice(1, None)),
+        "The critic reads what is known *after* each choice, which is what it should foresee: the features are hidden[:, :-1].",
+    ),
+    "reference-in-the-ratio": (
+        _iterating(old=lambda old, ref, new: ref),
+        "The ratio is against the reference: it belongs in the penalty. In the ratio stands the policy that wrote the texts.",
+    ),
+    "old-logps-renewed": (
+        _iterating(old=lambda old, ref, new: new),
+        "The old log-probabilities are computed anew in each minibatch, so that all ratios are 1 and the clip does nothing: ask once,"
+        " before the first step.",
+    ),
+    "penalty-forgotten": (
+        _iterating(kl_coef=0.0),
+        "Nothing holds the policy near the reference: hand settings.kl_coef to kl_penalized_rewards.",
+    ),
+    "penalty-turned-round": (
+        _iterating(rewards=lambda scores, old, ref, mask, price: ch95.kl_penalized_rewards(scores, ref, old, mask, price)),
+        "Policy and reference are exchanged in the penalty: it pays for leaving.",
+    ),
+    "not-whitened": (
+        _iterating(targets=lambda advantages, values, mask: (advantages, advantages + values)),
+        "The advantages go into the loss as they are, in units of score: whiten them.",
+    ),
+    "targets-whitened": (
+        _iterating(
+            targets=lambda advantages, values, mask: (
+                ch95.masked_whiten(advantages, mask),
+                ch95.masked_whiten(advantages, mask) + values,
+            )
+        ),
+        "The critic's targets are made of whitened advantages, which have lost the score's unit: add the values before whitening.",
+    ),
+    "targets-without-values": (
+        _iterating(targets=lambda advantages, values, mask: (ch95.masked_whiten(advantages, mask), advantages)),
+        "The critic is fitted to the advantages: its targets are advantages plus values.",
+    ),
+    "critic-not-trained": (
+        _iterating(value_loss=lambda errors, kept: 0 * errors.sum()),
+        "The critic never learns: the loss of a step is the policy's plus the mean of its squared errors.",
+    ),
+    "errors-halved": (
+        _iterating(value_loss=lambda errors, kept: 0.5 * ch95.masked_mean(errors**2, kept)),
+        "There is no half in front of the critic's squared errors.",
+    ),
+    "errors-in-padding": (
+        _iterating(value_loss=lambda errors, kept: (errors**2).mean()),
+        "The critic is fitted in prompt and padding, too, where it is asked nothing: masked_mean.",
+    ),
+    "uphill": (_iterating(sign=-1), "ppo_token_loss is negated already: step down its gradient."),
+    "one-epoch-only": (_iterating(epochs=1), "The texts are used once: settings.epochs says how often."),
+    "whole-batch-at-once": (
+        _iterating(parts=lambda count, s, generator: [torch.arange(count)]),
+        "There is one step in each pass: make one for each minibatch.",
+    ),
+    "gradient-not-shortened": (_iterating(max_grad_norm=1e9), "Hand settings.max_grad_norm to actor.step."),
+    "clip-range-fixed": (_iterating(clip_range=0.2), "The clip range is 0.2 whatever the settings say."),
+    "discounts-fixed": (_iterating(gamma=1.0, gae_lambda=0.95), "gamma and gae_lambda of the settings are not used."),
+    "written-anew": (
+        _iterating(again=True),
+        "New texts are written for each epoch: PPO uses one batch several times, which is what the ratio is for.",
+    ),
+    "advantages-renewed": (
+        _iterating(renewed=True),
+        "Rewards and advantages are computed again in each epoch, with the policy and the critic as they are then: estimate once.",
+    ),
+    "reference-trained": (
+        _iterating(trained=_ReferenceAsActor),
+        "The reference writes and is changed: the policy is actor.policy.",
+    ),
+    "reference-follows": (
+        _iterating(follow=True),
+        "The reference takes over the policy's weights: it is what training began from, and stays.",
+    ),
+    "copy-trained": (
+        _iterating(trained=lambda actor, reference: copy.deepcopy(actor)),
+        "The actor that was handed in has not changed: a copy was trained. Change it in place.",
+    ),
+    "kl-of-a-token": (
+        _iterating(
+            told=lambda scores, ratio, mask, fractions: (
+                _told(scores, ratio, mask, fractions) | {"kl": ch95.masked_mean(ratio, mask).item()}
+            )
+        ),
+        "kl is that of a token: add up each text's log-ratios, then take the mean over texts.",
+    ),
+}
+
+RLHF_ITERATION = Exercise(
+    name="rlhf_iteration",
+    reference=ch95.rlhf_iteration,
+    criteria={"values": 3.0},
+    cases=(
+        _iter("what it learns in six iterations", _iteration(**_LONG, kl_coef=0.0, learning_rate=30.0), **_HABITS, visible=True),
+        _iter("what a high price holds", _iteration(**_LONG, kl_coef=8.0, learning_rate=3.0), **_HABITS, visible=True),
+        _iter("actor and reference after one iteration", _iteration(), **_BOTH, visible=True),
+        _iter("a policy that is its reference", _iteration(moved=0.0), **_BOTH),
+        _iter("narrow bounds, many passes", _iteration(clip_range=0.02, epochs=4), **_BOTH, visible=True),
+        _iter("a short gradient", _iteration(max_grad_norm=0.003), **_BOTH),
+        _iter("what is told", _iteration(clip_range=0.02, epochs=3), visible=True),
+        _iter("steps of small minibatches", _iteration(minibatch=4), returns=("actor",), view="steps_made", visible=True),
+        _iter("what is drawn from", _iteration(), returns=("generator",), view="drawn_from"),
+    ),
+    misconceptions=wrong(_WRONG_RLHF_ITERATION),
+    variants={
+        "parts by name": _iterating(),
+        "kept tokens only": _row_by_row,
+        "slices of a permutation": _iterating(
+            parts=lambda count, s, generator: torch.randperm(count, generator=generator).split(s.minibatch)
+        ),
+        "advantages shifted and scaled by hand": _iterating(
+            targets=lambda a, values, mask: ((a - a[mask].mean()) / (a[mask].var(correction=0) + 1e-8).sqrt(), a + values)
+        ),
+    },
+)
+
 # ------------------------------------------------------------------------------------------------- repaired_reward_scaling
 
 
@@ -1136,5 +1436,6 @@ EXERCISES = (
     MASKED_WHITEN,
     MASKED_GAE,
     PPO_TOKEN_LOSS,
+    RLHF_ITERATION,
     REPAIRED_REWARD_SCALING,
 )

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,6 +35,7 @@ from autograder.authoring.parts import (
     wrong,
 )
 from autograder.authoring.spec import Case, Exercise, Misconception
+from course_lib.checks.cases import built
 from solutions import ch97
 
 # -------------------------------------------------------------------------------------------------------- sequence_logps
@@ -647,6 +651,320 @@ KL_OPTIMAL_POLICY = Exercise(
     },
 )
 
+# --------------------------------------------------------------------------------------------------------------- dpo_epoch
+
+
+@drawing
+def _epoch(generator, batches=((4, 0, 6), (2, 7, 1), (5, 3)), beta=0.5, moved=0.5, training=False, **settings):
+    """Eight pairs of short texts, and tables in place of networks; the policy is `moved` away from its reference."""
+    pairs, tokens = 8, 6
+    prompts = integers(generator, 1, 3, pairs)
+    lengths = prompts[:, None] + integers(generator, 1, 4, pairs, 2)
+    columns = torch.arange(int(lengths.max()))
+    input_ids = integers(generator, 0, tokens, pairs, 2, len(columns))
+    given = columns < prompts[:, None, None]
+    attention_mask = columns < lengths[:, :, None]
+    texts = {
+        "input_ids": torch.where(given, input_ids[:, :1], input_ids),
+        "attention_mask": attention_mask,
+        "completion_mask": attention_mask & ~given,
+    }
+    table = normal(generator, tokens, tokens)
+    policy = built("language.tables.Bigrams", table=table + moved * normal(generator, tokens, tokens), training=training)
+    return {
+        "policy": policy,
+        "reference": built("language.tables.Bigrams", table=table),
+        "pairs": built("language.direct.Pairs", **texts),
+        "batches": [torch.tensor(batch) for batch in batches],
+    } | {"beta": beta, "learning_rate": 0.05, "max_grad_norm": 100.0, **settings}
+
+
+def _text_logps(model, parts):
+    """log π of both texts of each pair, (B, 2)."""
+    input_ids, attention_mask, mask = (part.flatten(0, 1) for part in parts)
+    return ch97.sequence_logps(model.logits(input_ids, attention_mask), input_ids, mask).unflatten(0, (-1, 2))
+
+
+def _means(losses, chosen, rejected):
+    right = (chosen > rejected).to(losses.dtype)
+    parts = {"loss": losses, "accuracy": right, "chosen_rewards": chosen, "rejected_rewards": rejected}
+    return {name: part.mean().detach() for name, part in parts.items()}
+
+
+def _joined(rows):
+    return {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
+
+
+def _ref_now(policy, reference, pairs, rows, logps):
+    with torch.no_grad():
+        return _text_logps(reference, pairs.of(rows))
+
+
+def _from_policy_at_first(policy, reference, pairs, batches):
+    """What the policy says before the first step, for all pairs."""
+    with torch.no_grad():
+        known = _text_logps(policy, pairs)
+    return lambda policy, reference, pairs, rows, logps: known[rows]
+
+
+def _asked_once(policy, reference, pairs, batches):
+    """A variant: the reference is asked once, before the first step."""
+    with torch.no_grad():
+        known = _text_logps(reference, pairs)
+    return lambda policy, reference, pairs, rows, logps: known[rows]
+
+
+def _sides(logps, ref_logps):
+    return (*logps.unbind(1), *ref_logps.unbind(1))
+
+
+def _halved(logps, ref_logps):
+    """The first half of all texts taken for the chosen ones, which alternate with the rejected."""
+    return (*logps.flatten().chunk(2), *ref_logps.flatten().chunk(2))
+
+
+def _stepping(
+    logps_of=_text_logps,
+    ref=lambda *_: _ref_now,
+    sides: Callable[..., tuple] = _sides,
+    reduce=torch.mean,
+    clear=True,
+    every_step=True,
+    optimizer=lambda policy, rate: torch.optim.AdamW(policy.parameters(), lr=rate, weight_decay=0.0),
+    anew=False,
+    batches_of=list,
+    trained=lambda policy, reference: policy,
+    mode=None,
+    told=_means,
+    told_after=False,
+    follow=False,
+    summary=_joined,
+    checked=True,
+    **fixed,
+):
+    """A version of the loop, from the places where it can go wrong; `fixed` are settings of its own, whatever the caller's are."""
+
+    def version(policy, reference, pairs, batches, beta=0.1, learning_rate=2e-4, max_grad_norm=1.0):
+        given = {"beta": beta, "learning_rate": learning_rate, "max_grad_norm": max_grad_norm} | fixed
+        if beta <= 0:
+            if checked:
+                raise ValueError(f"beta must be above 0, got {beta}")
+            given["beta"] = 0.1
+        policy = trained(policy, reference)
+        if mode is not None:
+            policy.train(mode)
+        batches = batches_of(batches)
+        adam = optimizer(policy, given["learning_rate"])
+        rows: list[dict[str, torch.Tensor]] = []
+        ref_of = ref(policy, reference, pairs, batches)
+        adam.zero_grad()
+
+        def looked_at(picked):
+            logps = logps_of(policy, pairs.of(picked))
+            ref_logps = ref_of(policy, reference, pairs, picked, logps)
+            four = sides(logps, ref_logps)
+            return ch97.dpo_loss(four[0], four[1], four[2], four[3], given["beta"]), logps
+
+        for picked in batches:
+            if anew:
+                adam = optimizer(policy, given["learning_rate"])
+            answers, logps = looked_at(picked)
+            if clear and every_step:
+                adam.zero_grad()
+            reduce(answers[0]).backward()
+            if every_step or len(rows) == len(batches) - 1:
+                torch.nn.utils.clip_grad_norm_(policy.parameters(), given["max_grad_norm"])
+                adam.step()
+            if follow:
+                reference.load_state_dict(policy.state_dict())
+            rows.append(told(*(looked_at(picked) if told_after else (answers, logps))[0]))
+        return summary(rows)
+
+    return version
+
+
+def _token_means(model, parts):
+    return _text_logps(model, parts) / parts.completion_mask.sum(-1)
+
+
+def _all_columns(model, parts):
+    return _text_logps(model, parts._replace(completion_mask=torch.ones_like(parts.completion_mask)))
+
+
+def _two_passes(policy, reference, pairs, batches, beta=0.1, learning_rate=2e-4, max_grad_norm=1.0):
+    """A variant: each side goes through the network for itself, the gradient is asked for and shortened by hand, the log grows in place."""
+    if not beta > 0:
+        raise ValueError("beta must be above 0")
+    weights = list(policy.parameters())
+    optimizer = torch.optim.Adam(weights, lr=learning_rate)
+    log: dict[str, list] = {"loss": [], "accuracy": [], "chosen_rewards": [], "rejected_rewards": []}
+    for rows in batches:
+        ids, attention, mask = pairs.of(rows)
+        logps = []
+        for model in (policy, reference):
+            for side in (0, 1):
+                logits = model.logits(ids[:, side], attention[:, side])
+                logps.append(ch97.sequence_logps(logits, ids[:, side], mask[:, side]))
+        losses, chosen, rejected = ch97.dpo_loss(logps[0], logps[1], logps[2].detach(), logps[3].detach(), beta=beta)
+        gradients = torch.autograd.grad(losses.sum() / len(losses), weights)
+        norm = sum(gradient.square().sum() for gradient in gradients) ** 0.5
+        for weight, gradient in zip(weights, gradients, strict=True):
+            weight.grad = gradient * min(1.0, max_grad_norm / (norm.item() + 1e-6))
+        optimizer.step()
+        for name, value in _means(losses, chosen, rejected).items():
+            log[name].append(value.item())
+    return {name: torch.tensor(values) for name, values in log.items()}
+
+
+def _as_they_come(batches):
+    """A variant's way through the batches, that needs no list."""
+    yield from batches
+
+
+_LEARNED: dict[str, Any] = {"returns": ("policy", "reference")}
+_WRONG_DPO_EPOCH = {
+    "gradient-never-cleared": (
+        _stepping(clear=False),
+        "backward() adds to the gradient that is there, so each step repeats all those before: optimizer.zero_grad() in front of it.",
+    ),
+    "one-step-in-all": (
+        _stepping(every_step=False),
+        "The gradients of all batches are added up for a single step: clear, backward and step belong to each batch.",
+    ),
+    "optimizer-anew-each-step": (
+        _stepping(anew=True),
+        "A new AdamW for each batch has forgotten its averages, and makes a step of full length in every coordinate: make it once.",
+    ),
+    "last-batch-dropped": (
+        _stepping(batches_of=lambda batches: [rows for rows in batches if len(rows) == max(map(len, batches))]),
+        "Batches that are smaller than others are left out: their pairs count as well.",
+    ),
+    "first-batch-only": (
+        _stepping(batches_of=lambda batches: list(batches)[:1]),
+        "It ends after the first batch: a return or break is one level too deep.",
+    ),
+    "sides-exchanged": (
+        _stepping(sides=lambda logps, ref: _sides(logps.flip(1), ref.flip(1))),
+        "Chosen and rejected texts are exchanged: in pairs, the chosen text stands at index 0 of the second axis.",
+    ),
+    "halves-for-sides": (
+        _stepping(sides=_halved),
+        "Flattened, chosen and rejected texts alternate: take every second one, or unflatten; the first half of the rows is not the"
+        " chosen side.",
+    ),
+    "uphill": (
+        _stepping(reduce=lambda losses: -losses.mean()),
+        "The loss is made large: dpo_loss is a negative log-likelihood already, so go down its gradient.",
+    ),
+    "reference-is-the-policy": (
+        _stepping(ref=lambda *_: lambda policy, reference, pairs, rows, logps: logps.detach()),
+        "The reference's log-probabilities come from the policy as it is now. Then every gap is 0 for ever, the loss stays at log 2,"
+        " and nothing holds the policy: ask `reference`.",
+    ),
+    "reference-is-the-start": (
+        _stepping(ref=_from_policy_at_first),
+        "The log-probabilities of the policy before this epoch stand in for the reference's: ask `reference`, from which a policy may"
+        " have moved in epochs before.",
+    ),
+    "reference-follows": (
+        _stepping(follow=True),
+        "The reference is changed: it takes over the policy's weights after each step. It stays as it is.",
+    ),
+    "reference-forgotten": (
+        _stepping(ref=lambda *_: lambda policy, reference, pairs, rows, logps: torch.zeros_like(logps)),
+        "The reference is missing from the gap: the log-probabilities of the policy alone do not say what it has learned.",
+    ),
+    "reference-trained": (
+        _stepping(trained=lambda policy, reference: reference),
+        "It is the reference that is trained here.",
+    ),
+    "copy-trained": (
+        _stepping(trained=lambda policy, reference: copy.deepcopy(policy)),
+        "The policy that was handed in has not changed: a copy was trained. Change it in place.",
+    ),
+    "sum-instead-of-mean": (
+        _stepping(reduce=torch.sum),
+        "A sum grows with the batch, and with it the gradient that is compared with max_grad_norm: take the mean over the pairs.",
+    ),
+    "gradient-not-shortened": (
+        _stepping(max_grad_norm=float("inf")),
+        "max_grad_norm is not used: shorten the gradient before the step.",
+    ),
+    "beta-fixed": (_stepping(beta=0.1), "beta is 0.1 whatever the caller says: hand it to dpo_loss."),
+    "learning-rate-fixed": (_stepping(learning_rate=2e-4), "The learning rate is 2e-4 whatever the caller says."),
+    "weight-decay": (
+        _stepping(optimizer=lambda policy, rate: torch.optim.AdamW(policy.parameters(), lr=rate)),
+        "AdamW shrinks all weights by default, which is a pull that no pair asked for: weight_decay=0.0.",
+    ),
+    "plain-descent": (
+        _stepping(optimizer=lambda policy, rate: torch.optim.SGD(policy.parameters(), lr=rate)),
+        "This is plain gradient descent: torch.optim.AdamW is asked for.",
+    ),
+    "all-columns-counted": (
+        _stepping(
+            logps_of=_all_columns,
+            ref=lambda *_: lambda policy, reference, pairs, rows, logps: _all_columns(reference, pairs.of(rows)).detach(),
+        ),
+        "Padding is counted: the third of the tensors is the mask of what the policy would have to write.",
+    ),
+    "mean-over-tokens": (
+        _stepping(
+            logps_of=_token_means,
+            ref=lambda *_: lambda policy, reference, pairs, rows, logps: _token_means(reference, pairs.of(rows)).detach(),
+        ),
+        "Log-probabilities are divided by lengths: a text's is the sum over its tokens.",
+    ),
+    "training-mode": (
+        _stepping(mode=True),
+        "policy.train() switches dropout on, and a policy that drops units differs from its reference before it has learned anything:"
+        " leave the mode as it is.",
+    ),
+    "eval-mode": (_stepping(mode=False), "policy.eval() changes the mode that the policy came in: leave it as it is."),
+    "logged-after-the-step": (
+        _stepping(told_after=True),
+        "What is logged was computed after the step, on the batch that was just learned from: log what was so before it.",
+    ),
+    "last-batch-logged": (
+        _stepping(summary=lambda rows: rows[-1]),
+        "Only the last batch is logged: return (steps,) tensors, an entry for each.",
+    ),
+    "epoch-averaged": (
+        _stepping(summary=lambda rows: {name: column.mean() for name, column in _joined(rows).items()}),
+        "The epoch's means are returned: one entry for each step is asked for.",
+    ),
+    "graph-kept": (
+        _stepping(told=lambda losses, *rewards: _means(losses, *rewards) | {"loss": losses.mean()}),
+        "The logged losses carry a graph each, and keep all activations of the epoch alive: detach them.",
+    ),
+}
+
+DPO_EPOCH = Exercise(
+    name="dpo_epoch",
+    reference=ch97.dpo_epoch,
+    criteria={"values": 2.3, "gradient": 0.1, "errors": 0.1},
+    cases=drawn_once(
+        Case("both models after an epoch", _epoch(), **_LEARNED, visible=True, draws=2),
+        Case("what is logged of it", _epoch(), view="log_of_steps", visible=True),
+        Case("a policy that is its reference", _epoch(moved=0.0), view="log_of_steps", visible=True),
+        Case("a long gradient", _epoch(max_grad_norm=0.01), **_LEARNED, visible=True, draws=2),
+        Case("another price, and small steps", _epoch(beta=2.0, learning_rate=0.003), **_LEARNED),
+        Case("batches that share a pair, and leave others out", _epoch(((1, 2), (2,), (2, 5, 1))), **_LEARNED),
+        Case("one pair at a time", _epoch(((3,), (0,))), **_LEARNED),
+        Case("a policy in training mode", _epoch(training=True), **_LEARNED),
+        refused(_epoch(), beta=0.0, visible=True),
+    ),
+    misconceptions=(
+        *wrong(_WRONG_DPO_EPOCH),
+        bad_input_accepted(_stepping(checked=False), "beta = 0 must be refused by a ValueError that names it, as dpo_loss does."),
+    ),
+    variants={
+        "two passes, and a gradient by hand": _two_passes,
+        "the loop with its parts": _stepping(),
+        "the reference asked once": _stepping(ref=_asked_once),
+        "batches as they come": _stepping(batches_of=lambda batches: _as_they_come(batches)),
+    },
+)
+
 # ------------------------------------------------------------------------------------------------ repaired_completion_mask
 
 
@@ -761,4 +1079,4 @@ REPAIRED_COMPLETION_MASK = Exercise(
     },
 )
 
-EXERCISES = (SEQUENCE_LOGPS, DPO_LOSS, IPO_LOSS, KL_OPTIMAL_POLICY, REPAIRED_COMPLETION_MASK)
+EXERCISES = (SEQUENCE_LOGPS, DPO_LOSS, IPO_LOSS, KL_OPTIMAL_POLICY, DPO_EPOCH, REPAIRED_COMPLETION_MASK)

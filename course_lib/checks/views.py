@@ -192,3 +192,88 @@ def answers_of_a_table(arguments: Mapping[str, Any], outputs: Mapping[str, np.nd
         "right more often than not": np.array([share > 0.5 for share in right]),
         "logits before the answer moved": np.array(bool((table[:, 0] - before[:, 0]).abs().max() > 1e-3)),
     }
+
+
+def diary_of_training(arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What all right trainings of a control.clips.WatchedScorer have in common, whatever their random orders.
+
+    Args:
+      arguments: training_pairs and held_out_pairs, (chosen, rejected) each, whose clips are numbered in actions[:, 0, 0]; num_epochs.
+      outputs: "diary" (N, 2), a row (clip, step) for each clip that was learned from.
+
+    Returns: the number of steps; how often a training clip was learned from at least and at most; and truth values: whether held-out clips
+      were, whether the two clips of a pair were apart, whether all epochs had the same minibatches, and whether all were neighbours.
+    """
+    diary = outputs.get("diary")
+    if diary is None or diary.ndim != 2 or not len(diary):
+        raise ValueError("nothing was learned from any clip")
+
+    def numbers(pairs: Any) -> list[np.ndarray]:
+        return [np.asarray(clips["arguments"]["actions"])[:, 0, 0].astype(int) for clips in pairs]
+
+    sides = numbers(arguments["training_pairs"])
+    places = {int(clip): place for side in sides for place, clip in enumerate(side)}
+    when = {clip: diary[diary[:, 0] == clip, 1].tolist() for clip in places}
+    learned = [len(steps) for steps in when.values()]
+    batches: dict[int, set[int]] = {}
+    for clip, step in diary.tolist():
+        if clip in places:
+            batches.setdefault(step, set()).add(places[clip])
+    in_turn = [frozenset(batches[step]) for step in sorted(batches)]
+    size = max(1, -(-len(in_turn) // arguments["num_epochs"]))
+    epochs = [set(in_turn[start : start + size]) for start in range(0, len(in_turn), size)]
+    return {
+        "steps": np.asarray(len(np.unique(diary[:, 1]))),
+        "a clip's times at least": np.asarray(min(learned)),
+        "a clip's times at most": np.asarray(max(learned)),
+        "held-out clips were learned from": np.asarray(
+            bool(np.isin(diary[:, 0], np.concatenate(numbers(arguments["held_out_pairs"]))).any())
+        ),
+        "the clips of a pair were apart": np.asarray(any(when[int(c)] != when[int(r)] for c, r in zip(*sides, strict=True))),
+        "the same minibatches in each epoch": np.asarray(len(epochs) > 1 and all(epoch == epochs[0] for epoch in epochs)),
+        "neighbours only": np.asarray(all(max(batch) - min(batch) == len(batch) - 1 for batch in in_turn)),
+    }
+
+
+def weights_learned(_arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Of a module's parameters and buffers those called "weights": what else it has written down is left out."""
+    if "weights" not in outputs:
+        raise ValueError("there are no weights")
+    return {"weights": outputs["weights"]}
+
+
+def habits_of_a_table(arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What the policy of a language.tables.TableActor writes after training, beside its reference.
+
+    Args:
+      arguments: reference and score, as they were built.
+      outputs: "policy.table" (V, V).
+
+    Returns: truth values: whether the token that the score counts follows most others more often than not, and whether on average over
+      tokens the divergence from the reference is below 0.05 nats.
+    """
+    if "policy.table" not in outputs:
+        raise ValueError("there is no policy's table")
+    tables = (outputs["policy.table"], np.asarray(arguments["reference"]["arguments"]["table"]))
+    ours, theirs = (torch.as_tensor(table).double()[:-1].log_softmax(-1) for table in tables)
+    liked = ours[:, arguments["score"]["arguments"]["token"]].exp()
+    divergence = (ours.exp() * (ours - theirs)).sum(1).mean()
+    return {
+        "the liked token is written": np.asarray(bool(liked.median() > 0.5)),
+        "stays near the reference": np.asarray(bool(divergence < 0.05)),
+    }
+
+
+def losses_seen(_arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """A tensor of losses in double precision, whatever its own."""
+    losses = outputs.get("")
+    if losses is None or losses.ndim != 1 or losses.dtype.kind != "f":
+        raise ValueError("the losses must be one tensor of numbers, (entries,)")
+    return {"losses": losses.astype(np.float64)}
+
+
+def log_of_steps(_arguments: Mapping[str, Any], outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """A dict of tensors with an entry for each step, in double precision, whatever their own."""
+    if not outputs or any("." in name or column.dtype.kind != "f" for name, column in outputs.items()):
+        raise ValueError("the log must be a dict of tensors, (steps,) each")
+    return {name: column.astype(np.float64) for name, column in outputs.items()}

@@ -118,6 +118,59 @@ class QuadraticReward:
         return obs @ self.linear + obs.square() @ self.quadratic + self.bias.squeeze()
 
 
+class Scorer(nn.Module):
+    """What a reward model gives to whole clips: called with Segments of B clips, it returns their learned returns, (B,).
+
+    Args:
+      model: torch module that gives observations (..., O) their rewards, (...,).
+      returns_of: `returns_of(model, obs, mask) -> (B,)`, how rewards make returns.
+    """
+
+    def __init__(self, model, returns_of):
+        super().__init__()
+        self.model, self.returns_of = model, returns_of
+
+    def forward(self, segments):
+        """See the class."""
+        return self.returns_of(self.model, segments.obs, segments.mask)
+
+
+class WatchedScorer(nn.Module):
+    """A scorer for trying out a training loop in milliseconds: a reward that is linear in the observations, and a diary.
+
+    The diary has a row (clip, step) for each clip whose return passed gradient back: its number, which stands in actions[:, 0, 0], and
+    how many different weights the scorer had had before. It is a buffer, and remains when weights are loaded.
+
+    Args:
+      weights: (O,) tensor.
+    """
+
+    def __init__(self, weights):
+        super().__init__()
+        self.weights = nn.Parameter(weights)
+        self.seen, self.moves = weights.clone(), -1
+        self.diary: torch.Tensor
+        self.register_buffer("diary", torch.zeros(0, 2, dtype=torch.int64))
+
+    def forward(self, segments):
+        """Returns of all clips, (B,)."""
+        weights = self.weights.detach()
+        if self.moves < 0 or not torch.equal(weights, self.seen):
+            self.seen, self.moves = weights.clone(), self.moves + 1
+        returns = (segments.obs @ self.weights).masked_fill(~segments.mask, 0).sum(1)
+        if returns.requires_grad:
+            rows = torch.stack([segments.actions[:, 0, 0].long(), torch.full((len(returns),), self.moves)], 1)
+            returns.register_hook(lambda gradient: self._write(rows[gradient != 0]))
+        return returns
+
+    def _write(self, rows):
+        self.diary = torch.cat([self.diary, rows])
+
+    def _load_from_state_dict(self, state_dict, prefix, *rest):
+        state_dict[f"{prefix}diary"] = self.diary
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
 def fit(model, chosen, rejected, loss, steps=300, batch_size=32, learning_rate=2e-3, weight_decay=0.01, seed=0):
     """Fit a reward model to comparisons, in place, with AdamW.
 

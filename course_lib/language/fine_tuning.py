@@ -140,6 +140,31 @@ class Writer:
         return self.taught.per_token_logps(self.policy.logits(input_ids, attention_mask), input_ids)
 
 
+class ActorCritic:
+    """A policy, the critic of `train`, and one optimiser for both: what an iteration of PPO on tokens changes.
+
+    Args:
+      policy: language model that learns.
+      settings: its learning rates are used here.
+    """
+
+    def __init__(self, policy: lm.LanguageModel, settings: TokenPPO):
+        self.policy = policy
+        self.critic = torch.nn.Sequential(torch.nn.Linear(policy.width, 64), torch.nn.Tanh(), torch.nn.Linear(64, 1))
+        groups = [
+            {"params": policy.parameters(), "lr": settings.learning_rate},
+            {"params": self.critic.parameters(), "lr": settings.critic_learning_rate},
+        ]
+        self.optimizer = torch.optim.AdamW(groups, weight_decay=0.0)
+
+    def step(self, loss: torch.Tensor, max_grad_norm: float) -> None:
+        """One step down the gradient of a loss; the policy's is shortened to this norm if it is longer."""
+        self.optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.policy.parameters(), max_grad_norm)
+        self.optimizer.step()
+
+
 @torch.no_grad()
 def estimate(writer: Writer, critic, writing: Writing, settings: TokenPPO) -> tuple[torch.Tensor, torch.Tensor]:
     """Whitened advantages of the tokens, and what the critic should have said of them; (B, L - 1) each."""

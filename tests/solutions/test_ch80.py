@@ -5,9 +5,10 @@ import math
 import pytest
 import torch
 
-from course_lib.control.clips import QuadraticReward
+from course_lib.control.clips import QuadraticReward, Segments, WatchedScorer
 from solutions.ch80 import (
     bradley_terry_loss,
+    fit_reward_model,
     preference_accuracy,
     preference_probability,
     repaired_segment_returns,
@@ -107,6 +108,41 @@ def test_equal_rewards_become_zero():
     assert not standardize_rewards(torch.full((2, 3), 4.0), MASK[:2, :3]).any()
 
 
+def clip_pairs(first, gaps):
+    """Pairs of clips of one step whose returns differ by these gaps under a weight of 1."""
+    sides = []
+    for side, way in enumerate((0.5, -0.5)):
+        numbers = (first + side + 2.0 * torch.arange(len(gaps))).reshape(-1, 1, 1)
+        obs = (way * row(*gaps)).reshape(-1, 1, 1)
+        sides.append(Segments(obs, numbers, torch.zeros(len(gaps), 1), torch.ones(len(gaps), 1, dtype=torch.bool)))
+    return sides
+
+
+def fitted(held_out_gaps, epochs=40, pairs=6):
+    scorer, generator = WatchedScorer(row(0.0)), torch.Generator().manual_seed(0)
+    training, held_out = clip_pairs(0, [1.0] * pairs), clip_pairs(100, held_out_gaps)
+    losses = fit_reward_model(scorer, training, held_out, epochs, 4, 0.05, generator)
+    return scorer, losses
+
+
+def test_a_fitted_reward_stops_at_the_log_odds_of_the_held_out_answers():
+    scorer, losses = fitted([1.0, 1.0, 1.0, -1.0])
+    assert scorer.weights.item() == pytest.approx(math.log(3), abs=0.06)
+    assert losses[0].item() == pytest.approx(math.log(2)) and losses.min() < losses[-1]
+    assert not losses.requires_grad and len(losses) == 41
+
+
+def test_a_reward_that_training_only_harms_stays_as_it_came():
+    scorer, losses = fitted([-1.0], epochs=3)
+    assert scorer.weights.item() == 0 and losses.argmin() == 0
+
+
+def test_every_pair_is_learned_from_once_an_epoch_and_no_held_out_one():
+    scorer, _ = fitted([1.0], epochs=3)
+    assert scorer.diary[:, 0].bincount().tolist() == [3] * 12
+    assert scorer.diary[:, 1].unique().tolist() == list(range(6))
+
+
 def test_repaired_returns_do_not_depend_on_the_padding():
     model = QuadraticReward(row(1, -1), row(2, 0), row(5))
     obs = torch.randn(3, 4, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -126,6 +162,7 @@ def test_repaired_returns_do_not_depend_on_the_padding():
         (lambda: bradley_terry_loss(row(1, 2), row(1)), r"rejected_returns \(1,\)"),
         (lambda: preference_accuracy(row(1, 2), row(1)), r"rejected_returns \(1,\)"),
         (lambda: standardize_rewards(REWARDS, MASK[:, :1]), r"mask \(3, 1\)"),
+        (lambda: fitted([1.0], epochs=0), "num_epochs must be at least 1, got 0"),
         (lambda: repaired_segment_returns(lambda obs: obs[..., 0], torch.zeros(3, 4, 2), MASK[:1]), r"mask \(1, 4\)"),
     ],
 )

@@ -5,7 +5,10 @@ import math
 import pytest
 import torch
 
-from solutions import ch43, ch44
+from course_lib.language import fine_tuning, lm
+from course_lib.language.tables import Bigrams, TableActor, fondness
+from course_lib.seeding import seed_everything
+from solutions import ch43, ch44, ch45, ch95
 from solutions.ch95 import (
     completion_mask,
     kl_penalized_rewards,
@@ -15,6 +18,7 @@ from solutions.ch95 import (
     per_token_logps,
     ppo_token_loss,
     repaired_reward_scaling,
+    rlhf_iteration,
 )
 from solutions.ch97 import sequence_logps
 
@@ -161,3 +165,38 @@ def test_a_text_of_zeros_stays_worth_nothing_however_long():
     rewards, mask = rows([0, 0, 0, 0], [3, 0, 0, 0]), masks("xxxx", "x...")
     assert repaired_reward_scaling(rewards, mask)[0].tolist() == [0, 0, 0, 0]
     assert masked_whiten(rewards, mask)[0].sum() < -1  # what the suspect program did
+
+
+def taught_to_like(kl_coef, learning_rate, iterations=12):
+    """What a table's policy does after iterations that pay for the token 1: (V - 1, V) probabilities, and the last iteration's log."""
+    table, generator = torch.zeros(4, 4, dtype=torch.float64), torch.Generator().manual_seed(0)
+    actor, reference = TableActor(table.clone(), torch.zeros(1, 4, dtype=torch.float64), learning_rate, 0.2), Bigrams(table)
+    settings = fine_tuning.TokenPPO(kl_coef=kl_coef, new_tokens=5, minibatch=500)
+    for _ in range(iterations):
+        log = rlhf_iteration(actor, reference, ["0", "21", "2"] * 8, fondness(1), settings, generator)
+    assert not reference.table.any() and actor.steps == 2 * iterations
+    return actor.policy.table.detach()[:-1].softmax(-1), log
+
+
+def test_iterations_teach_what_is_paid_for_and_a_high_price_holds():
+    free, log = taught_to_like(0.0, 12.0)
+    held, log_held = taught_to_like(5.0, 2.0)
+    assert free[:, 1].median() > 0.5 > 0.35 > held[:, 1].max()
+    assert log["score"] > 3 > log_held["score"] and log["kl"] > 1 > log_held["kl"]
+
+
+def test_an_iteration_on_a_language_model_is_that_of_the_library():
+    reference, settings = lm.load("tiny").frozen_copy(), fine_tuning.TokenPPO(batch=6, minibatch=4, new_tokens=8, iterations=1)
+    prompts = ["The film is", "A", "This movie has", "It", "One of the", "What"]
+    writer = fine_tuning.Writer(
+        lm.load("tiny"), reference, fine_tuning.vader_scores, fine_tuning.Taught.of(vars(ch95), vars(ch45))
+    )
+    (theirs,) = fine_tuning.train(writer, prompts, settings, seed=0)
+    policy = lm.load("tiny")
+    generator = seed_everything(0)
+    actor = fine_tuning.ActorCritic(policy, settings)
+    asked = [prompts[pick] for pick in torch.randint(6, (6,), generator=generator).tolist()]
+    ours = rlhf_iteration(actor, reference, asked, fine_tuning.vader_scores, settings, generator)
+    assert ours == pytest.approx({name: theirs[name] for name in ours}, rel=1e-4, abs=1e-5)
+    for mine, library in zip(policy.parameters(), writer.policy.parameters(), strict=True):
+        assert torch.allclose(mine, library, atol=2e-5)

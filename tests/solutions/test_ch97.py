@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from solutions.ch97 import dpo_loss, ipo_loss, kl_optimal_policy, repaired_completion_mask, sequence_logps
+from course_lib.language import direct, lm, tables
+from solutions.ch97 import dpo_epoch, dpo_loss, ipo_loss, kl_optimal_policy, repaired_completion_mask, sequence_logps
 
 
 def row(*numbers, dtype=torch.float64):
@@ -170,6 +171,45 @@ def test_rewards_recovered_from_the_optimum_differ_by_a_constant_only():
 def test_huge_rewards_stay_probabilities_and_impossible_answers_stay_impossible():
     found = kl_optimal_policy(row(0.5, 0.5, 0.0), row(10_000, -10_000, 1e6), beta=0.01)
     assert found.tolist() == [1, 0, 0]
+
+
+# ----------------------------------------------------------------------------------------------------------- dpo_epoch
+
+
+def two_words(*pairs):
+    """Pairs of texts of one given and one written token."""
+    input_ids = torch.tensor([[[0, chosen], [0, rejected]] for chosen, rejected in pairs])
+    own = torch.ones_like(input_ids, dtype=torch.bool)
+    return direct.Pairs(input_ids, own, own & torch.tensor([False, True]))
+
+
+def test_an_epoch_makes_the_chosen_likelier_and_leaves_the_reference_alone():
+    policy, reference = (tables.Bigrams(torch.zeros(4, 4, dtype=torch.float64)) for _ in range(2))
+    log = dpo_epoch(policy, reference, two_words((1, 2), (1, 3)), [torch.tensor([0]), torch.tensor([1])] * 5, 1.0, 0.1)
+    probabilities = policy.table[0].softmax(-1)
+    assert probabilities[1] > 0.25 > probabilities[2] and not reference.table.any()
+    assert log["loss"][0].item() == pytest.approx(math.log(2)) and log["loss"][-1] < log["loss"][1]
+    assert log["accuracy"].tolist() == [0, 1, *[1] * 8]
+    assert (log["chosen_rewards"][1:] > 0).all() and not any(column.requires_grad for column in log.values())
+
+
+def test_an_epoch_on_a_language_model_makes_the_steps_of_the_library():
+    policy = lm.load("tiny")
+    reference, other = policy.frozen_copy(), lm.load("tiny")
+    pairs = direct.encode_pairs(policy, [" a fine film", " good", " so funny"], [" bad", " a dull, long film", " so sad"])
+    batches = [torch.tensor([0, 2]), torch.tensor([1])]
+    log = dpo_epoch(policy, reference, pairs, batches)
+    ref_logps = direct.reference_logps(reference, pairs, sequence_logps)
+    optimizer = torch.optim.AdamW(other.parameters(), lr=2e-4, weight_decay=0.0)
+    rows = [direct.train_step(other, optimizer, pairs.of(rows), ref_logps[rows], dpo_loss, sequence_logps) for rows in batches]
+    assert log["loss"].tolist() == pytest.approx([row["loss"] for row in rows], rel=1e-3)
+    assert log["chosen_rewards"].tolist() == pytest.approx([0.1 * row["chosen_moved"] for row in rows], abs=1e-3)
+
+
+def test_an_epoch_without_a_price_is_refused():
+    policy = tables.Bigrams(torch.zeros(3, 3))
+    with pytest.raises(ValueError, match="beta must be above 0, got 0"):
+        dpo_epoch(policy, policy, two_words((1, 2)), [torch.tensor([0])], beta=0)
 
 
 # -------------------------------------------------------------------------------------------- repaired_completion_mask

@@ -121,3 +121,90 @@ def test_imagined_entries_of_shapes_that_do_not_fit_are_left_alone_and_others_ca
     assert all(views.until_the_end({}, outputs)[name] is outputs[name] for name in outputs)
     with pytest.raises(ValueError, match="obs, actions, rewards, continues"):
         views.until_the_end({}, {"obs": np.ones(3)})
+
+
+def clips_numbered(*numbers):
+    return {"arguments": {"actions": np.array(numbers, dtype=float).reshape(-1, 1, 1)}}
+
+
+TRAINING = {
+    "training_pairs": [clips_numbered(0, 2, 4), clips_numbered(1, 3, 5)],
+    "held_out_pairs": [clips_numbered(6), clips_numbered(7)],
+    "num_epochs": 2,
+}
+
+
+def diary_of(*steps):
+    """A diary of minibatches of clips, one after another."""
+    return np.array([(clip, step) for step, clips in enumerate(steps) for clip in clips])
+
+
+def test_a_right_training_is_one_whatever_its_order():
+    seen = [
+        views.diary_of_training(TRAINING, {"diary": diary_of(*steps)})
+        for steps in ([(0, 4, 1, 5), (2, 3), (2, 4, 3, 5), (0, 1)], [(3, 1, 2, 0), (5, 4), (1, 0, 5, 4), (3, 2)])
+    ]
+    assert {name: value.item() for name, value in seen[0].items()} == {
+        "steps": 4,
+        "a clip's times at least": 2,
+        "a clip's times at most": 2,
+        "held-out clips were learned from": False,
+        "the clips of a pair were apart": False,
+        "the same minibatches in each epoch": False,
+        "neighbours only": False,
+    }
+    assert {name for name in seen[0] if seen[0][name] != seen[1][name]} == set()
+
+
+@pytest.mark.parametrize(
+    ("steps", "name"),
+    [
+        ([(0, 4, 1, 5), (2, 3), (2, 4, 3, 5), (0, 1, 6, 7)], "held-out clips were learned from"),
+        ([(0, 4, 1, 3), (2, 5), (2, 4, 3, 5), (0, 1)], "the clips of a pair were apart"),
+        ([(0, 4, 1, 5), (2, 3)] * 2, "the same minibatches in each epoch"),
+        ([(0, 2, 1, 3), (4, 5), (2, 4, 3, 5), (0, 1)], "neighbours only"),
+    ],
+)
+def test_mistakes_of_a_training_are_seen(steps, name):
+    assert views.diary_of_training(TRAINING, {"diary": diary_of(*steps)})[name]
+
+
+def test_without_a_diary_or_weights_nothing_is_seen():
+    for outputs in ({}, {"diary": np.zeros((0, 2))}, {"diary": np.zeros(3)}):
+        with pytest.raises(ValueError, match="nothing was learned"):
+            views.diary_of_training(TRAINING, outputs)
+    with pytest.raises(ValueError, match="no weights"):
+        views.weights_learned({}, {"diary": np.zeros(3)})
+
+
+def test_habits_of_a_table():
+    table = np.zeros((4, 4))
+    arguments = {"reference": {"arguments": {"table": table}}, "score": {"arguments": {"token": 1}}}
+
+    def habits(changed):
+        return [bool(seen) for seen in views.habits_of_a_table(arguments, {"policy.table": changed}).values()]
+
+    liking, nearly = table.copy(), table.copy()
+    liking[:, 1] += 3
+    nearly[:, 1] += 0.1
+    assert (habits(liking), habits(nearly), habits(-liking)) == ([True, False], [False, True], [False, False])
+    with pytest.raises(ValueError, match="no policy's table"):
+        views.habits_of_a_table(arguments, {})
+
+
+def test_losses_and_logs_are_seen_in_double_precision():
+    column = np.ones(3, dtype=np.float32)
+    assert views.losses_seen({}, {"": column})["losses"].dtype == np.float64
+    assert views.log_of_steps({}, {"loss": column, "accuracy": column})["accuracy"].dtype == np.float64
+
+
+@pytest.mark.parametrize("outputs", [{}, {"0": np.ones(())}, {"": np.ones(())}, {"": np.ones(3, dtype=int)}])
+def test_what_is_no_tensor_of_losses_is_refused(outputs):
+    with pytest.raises(ValueError, match="one tensor of numbers"):
+        views.losses_seen({}, outputs)
+
+
+@pytest.mark.parametrize("outputs", [{}, {"0.loss": np.ones(3)}, {"loss": np.ones(3, dtype=int)}])
+def test_what_is_no_log_is_refused(outputs):
+    with pytest.raises(ValueError, match="dict of tensors"):
+        views.log_of_steps({}, outputs)
