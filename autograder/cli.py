@@ -218,6 +218,13 @@ def similar(
         raise typer.Exit(LEFT_OVER)
 
 
+class Wall(StrEnum):
+    """What stands between a learner's code and the machine: grading.sandbox.WALLS."""
+
+    bubblewrap = "bubblewrap"
+    gvisor = "gvisor"
+
+
 @app.command()
 def grade(
     submitted: Annotated[Path, typer.Argument(help="The folder that holds STUDENT/ASSIGNMENT/ASSIGNMENT.ipynb.")],
@@ -232,6 +239,9 @@ def grade(
     due: Annotated[
         Path | None, typer.Option(help="A YAML file of due dates, extensions and a penalty; SUBMITTED/.due.yml by default.")
     ] = None,
+    wall: Annotated[
+        Wall, typer.Option(help="What the sandbox is made of; `course doctor` says which this machine has.")
+    ] = Wall.bubblewrap,
     trust_submissions: Annotated[
         bool,
         typer.Option("--trust-submissions", help="Run WITHOUT a sandbox. For your own code only: it can do all that you can."),
@@ -241,7 +251,7 @@ def grade(
     failed, 4 something in the folder was not understood; what was seen stands on standard error."""
     from autograder.grading import forking
 
-    if submitted.is_dir() and not (trust_submissions or scheduler):
+    if submitted.is_dir() and wall is Wall.bubblewrap and not (trust_submissions or scheduler):
         forking.course.begin()  # before anything here loads torch: the two take seconds, on a processor each
 
     from sqlalchemy.exc import SQLAlchemyError
@@ -258,7 +268,7 @@ def grade(
         try:
             results = grade.grade(
                 submitted, out, jobs, scheduler, timeout, db_url, trust_submissions,
-                lambda done, total, name: bar.update(task, completed=done, total=total), due, left.append,
+                lambda done, total, name: bar.update(task, completed=done, total=total), due, left.append, wall.value,
             )  # fmt: skip
         except (grade.GradingError, sandbox.SandboxUnavailable) as error:
             bar.stop()
