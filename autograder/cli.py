@@ -134,6 +134,13 @@ def check(notebook: Annotated[Path, typer.Argument(help="A student notebook.")])
     raise typer.Exit(command.main([str(notebook)]))
 
 
+class Wall(StrEnum):
+    """What stands between a learner's code and the machine: grading.sandbox.WALLS."""
+
+    bubblewrap = "bubblewrap"
+    gvisor = "gvisor"
+
+
 @app.command()
 def collect(
     downloads: Annotated[
@@ -156,6 +163,7 @@ def collect(
         bool, typer.Option("--best", help="Of several attempts keep the best, by grading them, not the last.")
     ] = False,
     timeout: Annotated[float, typer.Option(min=0.1, help="With --best: seconds for each exercise.")] = 60.0,
+    wall: Annotated[Wall, typer.Option(help="With --best: as in `course grade`.")] = Wall.bubblewrap,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be collected, and write nothing.")] = False,
 ) -> None:
     """Lay out what a learning platform lets you download, for `course grade`. Nothing is overwritten: earlier attempts are kept.
@@ -170,7 +178,7 @@ def collect(
     from autograder.grading import deadlines, sandbox
 
     try:
-        judge, environment = collect.grader(timeout) if best and not dry_run else (None, str)
+        judge, environment = collect.grader(timeout, wall.value) if best and not dry_run else (None, str)
         done = collect.collect(downloads, into, assignment, names, due, platform, pattern, judge, environment, dry_run)
     except (
         collect.CollectError, roster.RosterError, deadlines.DeadlineError, attempts.BrokenIndex, sandbox.SandboxUnavailable,
@@ -216,13 +224,6 @@ def similar(
         err.print(f"course: {line}", markup=False)
     if problems:
         raise typer.Exit(LEFT_OVER)
-
-
-class Wall(StrEnum):
-    """What stands between a learner's code and the machine: grading.sandbox.WALLS."""
-
-    bubblewrap = "bubblewrap"
-    gvisor = "gvisor"
 
 
 @app.command()
