@@ -269,7 +269,7 @@ def grade(
         try:
             results = grade.grade(
                 submitted, out, jobs, scheduler, timeout, db_url, trust_submissions,
-                lambda done, total, name: bar.update(task, completed=done, total=total), due, left.append, wall.value,
+                lambda done, total, name: bar.update(task, completed=done, total=total), due, left.append, wall=wall.value,
             )  # fmt: skip
         except (grade.GradingError, sandbox.SandboxUnavailable) as error:
             bar.stop()

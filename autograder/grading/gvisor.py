@@ -149,12 +149,12 @@ def _copy(files: Mapping[str, int], folder: Path) -> None:
             place.chmod(0o755)
 
 
-def around() -> str:
-    """Which container or gVisor this process runs in already; "" if it sees none."""
+def around(kernel: Path = Path("/proc/cmdline"), root: Path = Path("/")) -> str:
+    """Which container, or gVisor, this process itself runs in; "" if it sees none."""
     with suppress(OSError):
-        if "gvisor" in Path("/proc/cmdline").read_text():  # the kernel that it says it has booted
+        if "gvisor" in kernel.read_text():  # the kernel that it says it has booted
             return "gVisor"
-    for mark, name in (("/run/.containerenv", "a podman container"), ("/.dockerenv", "a docker container")):
-        if Path(mark).exists():
+    for mark, name in (("run/.containerenv", "a podman container"), (".dockerenv", "a docker container")):
+        if (root / mark).exists():
             return name
     return ""

@@ -452,7 +452,7 @@ def probe(torch: bool = False, server: ForkServer | None = None, wall: str = "bu
             with Sandbox(script, server=server, wall=wall) as sandbox:
                 answer = sandbox.receive(timeout=START_TIMEOUT).decode()
         except SandboxUnavailable as error:
-            return [Problem("no sandbox", str(error))]
+            return [Problem("no sandbox" if wall == "bubblewrap" else "it does not start", str(error))]
         except SandboxError as error:
             return [
                 Problem(f"a program that starts inside the sandbox does not answer: {error}", "Try again; then tell the makers.")
