@@ -32,4 +32,6 @@ def test_every_promise_names_its_proof():
 
 
 def test_every_test_that_is_named_exists(said):
-    assert [name.removeprefix(f"{ROOT}/") for name in re.findall(r"(?:not found:|no collectors for) (\S+)", said)] == [INVENTED], said[-3000:]
+    assert [name.removeprefix(f"{ROOT}/") for name in re.findall(r"(?:not found:|no collectors for) (\S+)", said)] == [
+        INVENTED
+    ], said[-3000:]
