@@ -252,6 +252,8 @@ def grade(
     failed, 4 something in the folder was not understood; what was seen stands on standard error."""
     from autograder.grading import forking
 
+    if trust_submissions and wall is not Wall.bubblewrap:
+        _stop(f"--trust-submissions puts up no wall, so there is no {wall} to be had with it: leave one of them out")
     if submitted.is_dir() and wall is Wall.bubblewrap and not (trust_submissions or scheduler):
         forking.course.begin()  # before anything here loads torch: the two take seconds, on a processor each
 

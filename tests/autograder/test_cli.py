@@ -53,6 +53,8 @@ def test_a_wall_that_this_machine_lacks_is_named_and_no_other_is_used(tmp_path, 
     assert result.exit_code == 2 and "runsc is missing" in result.output
     assert tuple(cli.Wall) == sandbox.WALLS
     assert run("grade", tmp_path / "submitted", "--wall", "paper").exit_code == 2
+    both = run("grade", tmp_path / "submitted", "--wall", "gvisor", "--trust-submissions")
+    assert both.exit_code == 2 and "leave one of them out" in both.output
 
 
 @pytest.mark.parametrize(
