@@ -11,7 +11,7 @@ from tests.attacks import test_attacks as behind_bubblewrap
 from tests.attacks import toolbox
 from tests.attacks.test_attacks import graded, student, verdict
 
-TIMEOUT = 8  # a process begins anew for each
+TIMEOUT = 15  # a process begins anew for each, behind a slower kernel
 HONEST = "honest-1"
 NAMES = (
     "environment_of_the_grader",  # secrets
