@@ -1,6 +1,8 @@
 # make book    build book/_build/html/index.html          make test   all tests (installs browsers and bubblewrap if it may)
 # make test ONLY=ch44    one chapter all the way, in about a minute
 # make release write the students' bundle into release/   make check  style, types and the quick tests
+# make fuzz    ten minutes of made-up notebooks and workers' answers, led by the code that they reach (installs atheris; MINUTES=60 for longer)
+# make semester  a class of STUDENTS=300 hands in ten chapters, and its teacher does what teachers do: hours, stopped and gone on with at will
 # make bench   how fast are the grader, beside stock nbgrader, PPO and SAC, beside Stable-Baselines3, and DPO, beside TRL (installs both)
 # The environment is .venv; it is brought up to date whenever the pins or pyproject.toml change.
 
@@ -17,7 +19,7 @@ QUICK := $(TWO_AT_A_TIME) --ignore=tests/e2e --ignore=tests/book --ignore=tests/
 
 unexport PYTHONDONTWRITEBYTECODE # or each of a thousand processes compiles the project anew
 
-.PHONY: book release test check bench install clean
+.PHONY: book release test check fuzz semester bench install clean
 
 book: install
 	$(BIN)/course book
@@ -52,6 +54,17 @@ bench: install
 	$(BIN)/python tools/bench_ppo.py
 	$(BIN)/python tools/bench_sac.py
 	$(BIN)/python tools/bench_dpo.py
+
+fuzz: install
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[fuzz]'
+	$(BIN)/python tools/fuzz.py --minutes $(or $(MINUTES),10)
+
+# What was done stays in FOLDER, and the same command goes on. The figures go into tools/semester.json and onto the teachers' page.
+STUDENTS ?= 300
+FOLDER ?= test-artefacts/semester-$(STUDENTS)
+semester: install
+	tools/system-packages
+	$(BIN)/python tools/semester.py $(FOLDER) --students $(STUDENTS) --jobs $(or $(JOBS),2) --record
 
 install: $(INSTALLED)
 

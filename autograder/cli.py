@@ -134,6 +134,13 @@ def check(notebook: Annotated[Path, typer.Argument(help="A student notebook.")])
     raise typer.Exit(command.main([str(notebook)]))
 
 
+class Wall(StrEnum):
+    """What stands between a learner's code and the machine: grading.sandbox.WALLS."""
+
+    bubblewrap = "bubblewrap"
+    gvisor = "gvisor"
+
+
 @app.command()
 def collect(
     downloads: Annotated[
@@ -156,6 +163,7 @@ def collect(
         bool, typer.Option("--best", help="Of several attempts keep the best, by grading them, not the last.")
     ] = False,
     timeout: Annotated[float, typer.Option(min=0.1, help="With --best: seconds for each exercise.")] = 60.0,
+    wall: Annotated[Wall, typer.Option(help="With --best: as in `course grade`.")] = Wall.bubblewrap,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be collected, and write nothing.")] = False,
 ) -> None:
     """Lay out what a learning platform lets you download, for `course grade`. Nothing is overwritten: earlier attempts are kept.
@@ -170,7 +178,7 @@ def collect(
     from autograder.grading import deadlines, sandbox
 
     try:
-        judge, environment = collect.grader(timeout) if best and not dry_run else (None, str)
+        judge, environment = collect.grader(timeout, wall.value) if best and not dry_run else (None, str)
         done = collect.collect(downloads, into, assignment, names, due, platform, pattern, judge, environment, dry_run)
     except (
         collect.CollectError, roster.RosterError, deadlines.DeadlineError, attempts.BrokenIndex, sandbox.SandboxUnavailable,
@@ -232,6 +240,9 @@ def grade(
     due: Annotated[
         Path | None, typer.Option(help="A YAML file of due dates, extensions and a penalty; SUBMITTED/.due.yml by default.")
     ] = None,
+    wall: Annotated[
+        Wall, typer.Option(help="What the sandbox is made of; `course doctor` says which this machine has.")
+    ] = Wall.bubblewrap,
     trust_submissions: Annotated[
         bool,
         typer.Option("--trust-submissions", help="Run WITHOUT a sandbox. For your own code only: it can do all that you can."),
@@ -241,7 +252,9 @@ def grade(
     failed, 4 something in the folder was not understood; what was seen stands on standard error."""
     from autograder.grading import forking
 
-    if submitted.is_dir() and not (trust_submissions or scheduler):
+    if trust_submissions and wall is not Wall.bubblewrap:
+        _stop(f"--trust-submissions puts up no wall, so there is no {wall} to be had with it: leave one of them out")
+    if submitted.is_dir() and wall is Wall.bubblewrap and not (trust_submissions or scheduler):
         forking.course.begin()  # before anything here loads torch: the two take seconds, on a processor each
 
     from sqlalchemy.exc import SQLAlchemyError
@@ -258,7 +271,7 @@ def grade(
         try:
             results = grade.grade(
                 submitted, out, jobs, scheduler, timeout, db_url, trust_submissions,
-                lambda done, total, name: bar.update(task, completed=done, total=total), due, left.append,
+                lambda done, total, name: bar.update(task, completed=done, total=total), due, left.append, wall=wall.value,
             )  # fmt: skip
         except (grade.GradingError, sandbox.SandboxUnavailable) as error:
             bar.stop()

@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 from rich.console import Console
 from rich.table import Table
 
-from autograder.grading import forking, sandbox
+from autograder.grading import forking, gvisor, sandbox
 
 ROOT = Path(__file__).resolve().parents[1]
 PYTHONS = (3, 11), (3, 13)  # the oldest and the newest that the pins are tried with
@@ -34,7 +34,7 @@ class Check:
 
 
 def checks() -> list[Check]:
-    """Looks at everything, the quick things first; a few seconds, most of them for importing torch inside the sandbox."""
+    """Looks at everything, the quick things first; most of the seconds go into importing torch inside sandboxes."""
     looks: tuple[Callable[[], Check], ...] = (
         _python,
         _packages,
@@ -42,6 +42,7 @@ def checks() -> list[Check]:
         _mujoco,
         _sandbox,
         _forks,
+        _wall,
         _flights,
         _nbgrader,
         _frozen,
@@ -135,6 +136,17 @@ def _forks() -> Check:
             "fork server", False, why, "Grading works, but takes some seconds longer for each submission.", required=False
         )
     return Check("fork server", True, "submissions share one process that has torch loaded")
+
+
+def _wall() -> Check:
+    """Which wall stands around a submission, and whether a stronger one could; grading works with either."""
+    inside = gvisor.around()
+    forked = "namespaces of its own, forked" if forking.course.get() else "bubblewrap, one process each"
+    used = f"{forked}{f'; all of it in {inside}' if inside else ''}"
+    if problems := sandbox.probe(torch=True, wall="gvisor"):
+        remedy = f"Only for code that you trust least: {problems[0].remedy}"
+        return Check("wall", False, f"{used}; gVisor, the stronger one: {problems[0].what}", remedy, required=False)
+    return Check("wall", True, f"{used}; the stronger one works, too: course grade --wall gvisor")
 
 
 def _flights() -> Check:

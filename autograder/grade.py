@@ -54,6 +54,7 @@ def grade(
     progress: Callable[[int, int, str], None] = lambda done, total, name: None,
     due: Path | None = None,
     left_over: Callable[[str], None] = lambda line: None,
+    wall: str = "bubblewrap",
 ) -> list[Verdict]:
     """Grade `submitted/{student}/{assignment}/{assignment}.ipynb` into `out`.
 
@@ -67,6 +68,7 @@ def grade(
       trusted: no sandbox. For one's own code only.
       progress: called with (done, total, "student/assignment") after each submission.
       due: due dates, see `grading.deadlines`; by default those in `submitted`, which `course collect` puts there.
+      wall: what the sandbox is made of, one of sandbox.WALLS.
       left_over: called with a line for each thing in `submitted` that was not understood: what was seen, and what it would take.
 
     Returns: the verdicts of this run, sorted by student and assignment.
@@ -80,11 +82,11 @@ def grade(
         for name in wanted:
             early.submit(judge.released, name)
         if not trusted:
-            if not scheduler:
+            if not scheduler and wall == "bubblewrap":
                 forking.course.begin()
-            sandbox.require()
+            sandbox.require(wall)
     out.mkdir(parents=True, exist_ok=True)
-    judging = _on_dask(tasks, scheduler, timeout) if scheduler else _here(tasks, jobs, timeout, trusted)
+    judging = _on_dask(tasks, scheduler, timeout, wall) if scheduler else _here(tasks, jobs, timeout, trusted, wall)
     with _one_run_at_a_time(out), judging as judged:
         sources.remember(out, submitted)
         return _write_all(tasks, judged, out, db_url, progress, rules)
@@ -132,7 +134,9 @@ def _write_all(
     return sorted(results, key=lambda verdict: (verdict.student, verdict.assignment))
 
 
-def judge_folder(student: str, assignment: str, folder: Path, timeout: float, trusted: bool = False) -> Judged:
+def judge_folder(
+    student: str, assignment: str, folder: Path, timeout: float, trusted: bool = False, wall: str = "bubblewrap"
+) -> Judged:
     """Judge one submission, wherever this runs; our own failures become infra_error after a second attempt.
 
     Any exception is ours, and must not cost the others their grades.
@@ -145,7 +149,7 @@ def judge_folder(student: str, assignment: str, folder: Path, timeout: float, tr
     for _ in range(ATTEMPTS):
         try:
             submission = intake.read(student, assignment, folder)
-            verdict = judge.judge(submission, release, timeout, trusted)
+            verdict = judge.judge(submission, release, timeout, trusted, wall)
             if submission.notebook is not None:
                 submission.notebook.metadata[FINGERPRINT] = submission.fingerprint
             return verdict, submission.notebook
@@ -212,10 +216,10 @@ def _register(book: GradebookWriter, assignment: str, released: NotebookNode, ru
 
 
 @contextmanager
-def _here(tasks: list[Task], jobs: int, timeout: float, trusted: bool) -> Iterator[Iterator[Judged]]:
+def _here(tasks: list[Task], jobs: int, timeout: float, trusted: bool, wall: str) -> Iterator[Iterator[Judged]]:
     """Judge on this machine, from the moment of entering, in threads: a verdict is made mostly by waiting."""
     pool = ThreadPoolExecutor(jobs)  # bubblewrap dies with the thread that started it, and these live to the end
-    futures = [pool.submit(judge_folder, *task, timeout, trusted) for task in tasks]
+    futures = [pool.submit(judge_folder, *task, timeout, trusted, wall) for task in tasks]
     try:
         yield (future.result() for future in as_completed(futures))
     finally:
@@ -223,10 +227,10 @@ def _here(tasks: list[Task], jobs: int, timeout: float, trusted: bool) -> Iterat
 
 
 @contextmanager
-def _on_dask(tasks: list[Task], scheduler: str, timeout: float) -> Iterator[Iterator[Judged]]:
+def _on_dask(tasks: list[Task], scheduler: str, timeout: float, wall: str) -> Iterator[Iterator[Judged]]:
     """Judge on the workers of a Dask scheduler, which must see the same files and have the same course."""
     handed = [(student, assignment, folder.resolve(), _content(folder)) for student, assignment, folder in tasks]
-    function = functools.partial(_judge_elsewhere, environment=judge.environment(), timeout=timeout)
+    function = functools.partial(_judge_elsewhere, environment=judge.environment(), timeout=timeout, wall=wall)
 
     def judged() -> Generator[Judged]:
         for one in side_by_side.run(function, handed, scheduler=scheduler):
@@ -246,7 +250,7 @@ class OtherWorker(RuntimeError):
     """What a worker would say of this submission is worth nothing."""
 
 
-def _judge_elsewhere(task: tuple[str, str, Path, str], environment: str, timeout: float) -> Judged:
+def _judge_elsewhere(task: tuple[str, str, Path, str], environment: str, timeout: float, wall: str = "bubblewrap") -> Judged:
     """Judge, on a worker. One with another file system would find nothing handed in, one with other checks would pay other points."""
     student, assignment, folder, content = task
     worker = f"the Dask worker on {socket.gethostname()}"
@@ -254,7 +258,7 @@ def _judge_elsewhere(task: tuple[str, str, Path, str], environment: str, timeout
         raise OtherWorker(f"{worker} has another version of the course: install the same everywhere")
     if _content(folder) != content:
         raise OtherWorker(f"{worker} does not see the files in {folder}: it must share this folder")
-    return judge_folder(student, assignment, folder, timeout)
+    return judge_folder(student, assignment, folder, timeout, wall=wall)
 
 
 def _content(folder: Path) -> str:

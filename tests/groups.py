@@ -5,7 +5,9 @@ from __future__ import annotations
 import re
 
 PAGE = re.compile(r"^(?:chapters/)?(ch\d+)(?:_\w+)?$")
-ID = re.compile(r"\[(?:chapters/)?(ch\d+|how-to/\w+|index|cheat-sheet|notation|kill-matrix|practice|atlas|autograd|format)")
+ID = re.compile(
+    r"\[(?:chapters/)?(ch\d+|how-to/\w+|index|cheat-sheet|notation|kill-matrix|threat-model|practice|atlas|autograd|format)"
+)
 # The files that take longest, in seconds of one core: they begin first, so that none is left over at the end.
 LONGEST = {
     "tests/autograder/proving/test_killmatrix.py": 300,

@@ -1,12 +1,15 @@
 """A simulated semester: a class hands in chapter after chapter, and everything that a teacher does with it is done by the real commands.
 
-    python tools/semester.py FOLDER [--students 300] [--chapters ch43 ch44 …] [--jobs 1] [--seed 0] [--record FILE]
+    python tools/semester.py FOLDER [--students 300] [--chapters ch43 ch44 … | --all-chapters] [--jobs 1] [--record]
 
 Every answer is drawn: the reference, another right answer or a named mistake of the checks, or the stub; some files are broken, and one
 submission in a hundred is one of tests/attacks. What each must score is known before anything is graded. Then, for each chapter, `course
 collect` and `course grade`; the first with a tolerance mistyped. A dozen open answers get their points in formgrader, in a
 browser; the check is mended and the chapter graded again; `course return` and `nbgrader export` give back. Every score must be as drawn.
-A run that was stopped goes on with the step that it was in. The record says minutes, memory (proportional) and disk.
+
+A class hands in by sections of `--section` students, and a step is what is done with one: a run that was stopped, kill -9 included, goes on
+with the step that it was in, by the same command, and counts that step from its last beginning. `--record` writes minutes, memory
+(proportional) and disk to tools/semester.json and onto the teachers' page; `--without-browser` leaves formgrader out.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ import copy
 import csv
 import dataclasses
 import functools
+import hashlib
 import importlib
 import inspect
 import io
@@ -34,7 +38,7 @@ import tempfile
 import threading
 import time
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -43,7 +47,6 @@ from urllib.request import urlopen
 import nbformat
 import psutil
 from nbgrader.api import Gradebook
-from playwright.sync_api import sync_playwright
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -55,8 +58,15 @@ from course_lib.checks.diagnosis import diagnose  # noqa: E402
 from tests.attacks import toolbox  # noqa: E402
 
 TIMEOUT = 10
+TEN = ("ch43", "ch44", "ch45", "ch48", "ch51", "ch74", "ch80", "ch95", "ch96", "ch97")
+RECORD = ROOT / "tools" / "semester.json"
+PAGE = ROOT / "book" / "how-to" / "teachers.md"
+TEN = ("ch43", "ch44", "ch45", "ch48", "ch51", "ch74", "ch80", "ch95", "ch96", "ch97")
+RECORD = ROOT / "tools" / "semester.json"
+PAGE = ROOT / "book" / "how-to" / "teachers.md"
 BY_HAND = 12  # open answers that a teacher grades in the browser
 MODULES = ("autograder/__init__.py", "autograder/authoring/*.py", "autograder/checks/*.py", "solutions/*.py")
+MODULES += ("experiments/__init__.py", "experiments/atlas/*.py", "experiments/atlas/records/*.json")  # whose rule a mistake is
 BROKEN = {  # the share of submissions that are broken so
     "absent": 0.03,
     "cut off": 0.01,
@@ -66,6 +76,12 @@ BROKEN = {  # the share of submissions that are broken so
     "metadata lost": 0.01,
     "renamed": 0.02,
 }
+UNPACK = """\
+import os, sys, zipfile
+if "/tmp/mine" not in sys.path:
+    zipfile.ZipFile("mine.dat").extractall("/tmp/mine")
+    sys.path.insert(0, "/tmp/mine")
+"""
 STATUS = dict.fromkeys(("cut off", "empty", "a PDF"), ("student_error",)) | {"metadata lost": ("needs_review", "graded")}
 SPOILT = """\
 import sys
@@ -87,12 +103,15 @@ def released(name: str) -> nbformat.NotebookNode:
 
 @functools.cache
 def modules() -> bytes:
-    """The checks and references, compiled, as a file beside the notebook, from where answers are imported."""
+    """The checks and references, compiled, as a file beside the notebook, where answers are unpacked and imported from."""
     file = io.BytesIO()
     with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for path in sorted(path for pattern in MODULES for path in ROOT.glob(pattern)):
-            compiled = py_compile.compile(str(path), f"{folder}/compiled", doraise=True)
-            archive.write(str(compiled), path.relative_to(ROOT).with_suffix(".pyc"))
+            if path.suffix == ".py":
+                compiled = py_compile.compile(str(path), f"{folder}/compiled", doraise=True)
+                archive.write(str(compiled), path.relative_to(ROOT).with_suffix(".pyc"))
+            else:
+                archive.write(path, path.relative_to(ROOT))
     return file.getvalue()
 
 
@@ -174,10 +193,7 @@ def files(name: str, student: str, submission: dict[str, Any]) -> dict[str, byte
                 "variant": f"variants[{[*exercise.variants][which]!r}]" if what == "variant" else "",
                 "mistake": f"misconceptions[{which}].function",
             }[what]
-            cell.source = (
-                f'import sys\nsys.path.insert(0, "mine.dat")\nfrom autograder.checks.{name} import EXERCISES\n'
-                f"{exercise.name} = EXERCISES[{number}].{place}"
-            )
+            cell.source = f"{UNPACK}from autograder.checks.{name} import EXERCISES\n{exercise.name} = EXERCISES[{number}].{place}"
             beside["mine.dat"] = modules()
         if exercise.name == submission["broken"]:
             cell.source = f"def {exercise.name}(:\n"
@@ -208,7 +224,7 @@ def attack(name: str) -> bytes | None:
 def attacks(seed: int, count: int) -> list[str]:
     names = sorted(path.parent.name for path in (ROOT / "tests" / "attacks").glob("*/attack.py"))
     random.Random(seed).shuffle(names)
-    kept = [name for name in names if name not in ("memory_hog", "endless_everything")]
+    kept = [name for name in names if name not in ("memory_hog", "endless_everything", "endless_tree")]
     found = []
     for name in kept:
         if len(found) == count:
@@ -216,6 +232,22 @@ def attacks(seed: int, count: int) -> list[str]:
         if not hasattr(importlib.import_module(f"tests.attacks.{name}.attack"), "STUDENT") and attack(name) is not None:
             found.append(name)
     return found
+
+
+def parted(students: list[str], size: int) -> list[list[str]]:
+    """The sections of a class."""
+    return [students[start : start + size] for start in range(0, len(students), size)]
+
+
+def rests_on() -> str:
+    """A hash of what answers, scores and attacks are drawn from."""
+    paths = [
+        path for pattern in (*MODULES, "chapters/*.md", "tests/attacks/*/*.*") for path in ROOT.glob(pattern) if path.is_file()
+    ]
+    digest = hashlib.sha256()
+    for path in sorted(paths):
+        digest.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
 
 
 def whole_class(name: str, students: list[str], seed: int, hostile: int) -> dict[str, dict[str, Any]]:
@@ -236,12 +268,23 @@ def whole_class(name: str, students: list[str], seed: int, hostile: int) -> dict
 class Semester:
     """A folder with a class's semester, and what its steps have cost so far."""
 
-    def __init__(self, folder: Path, students: int, chapters: list[str], jobs: int, seed: int) -> None:
+    def __init__(self, folder: Path, students: int, chapters: list[str], jobs: int, seed: int, section: int = 50) -> None:
         self.folder, self.chapters, self.jobs, self.seed = folder, chapters, jobs, seed
         self.students = [f"student{number:03}" for number in range(1, students + 1)]
-        self.hostile = max(1, students // 10)  # all in one week: one in a hundred of ten
+        self.sections = [self.students[start : start + section] for start in range(0, students, section)]
+        self.hostile = max(1, students * len(chapters) // 100)  # one in a hundred, all in one week
         self.out = folder / "grades"
         (folder / "steps").mkdir(parents=True, exist_ok=True)
+        self._must_be_the_same({"students": students, "chapters": chapters, "seed": seed, "section": section})
+
+    def _must_be_the_same(self, drawn: dict[str, Any]) -> None:
+        """A semester goes on with the numbers and the checks that it began with, or other scores would be drawn."""
+        drawn = {**drawn, "checks": rests_on()}
+        mark = self.folder / "drawn.json"
+        if not mark.exists():
+            mark.write_text(json.dumps(drawn) + "\n")
+        if other := [name for name, value in json.loads(mark.read_text()).items() if drawn[name] != value]:
+            raise SystemExit(f"{self.folder} holds a semester that was begun with other {', '.join(other)}: take another folder")
 
     @functools.cache  # noqa: B019  # one for each process
     def drawn(self, name: str) -> dict[str, dict[str, Any]]:
@@ -289,25 +332,27 @@ class Semester:
 
     # steps, in their order
 
-    def hand_in(self, name: str) -> None:
+    def hand_in(self, name: str, section: int) -> None:
         """The folder that Canvas's download unpacks to."""
-        folder = self.folder / "canvas" / name
+        folder = self.folder / "canvas" / f"{name}-{section}"
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        for number, (student, submission) in enumerate(self.drawn(name).items()):
-            for place, (file, content) in enumerate(files(name, student, submission).items()):
+        for student in self.sections[section]:
+            number = self.students.index(student)
+            for place, (file, content) in enumerate(files(name, student, self.drawn(name)[student]).items()):
                 (folder / f"{student}_{1000 + number}_{10 * number + place}_{file}").write_bytes(content)
 
-    def collect(self, name: str) -> None:
-        folder = self.folder / "submitted" / name
-        self.course("collect", self.folder / "canvas" / name, "--into", folder, "--assignment", name, may=(0, 4))
+    def collect(self, name: str, section: int) -> None:
+        download, folder = (self.folder / where / f"{name}-{section}" for where in ("canvas", "submitted"))
+        self.course("collect", download, "--into", folder, "--assignment", name, may=(0, 4))
 
-    def grade(self, name: str, spoilt: str = "") -> None:
-        words = ("grade", self.folder / "submitted" / name, "--out", self.out, "--jobs", self.jobs, "--timeout", TIMEOUT)
+    def grade(self, name: str, section: int, spoilt: str = "") -> None:
+        folder = self.folder / "submitted" / f"{name}-{section}"
+        words = ("grade", folder, "--out", self.out, "--jobs", self.jobs, "--timeout", TIMEOUT)
         self.course(*words, spoilt=spoilt, may=(0, 4))
-        self.as_drawn(name, spoilt)
+        self.as_drawn(name, spoilt, self.sections[section])
 
-    def by_hand(self) -> list[list[Any]]:
+    def by_hand(self, browser: bool = True) -> list[list[Any]]:
         """A teacher's points for the first open answers of the first chapter, typed into formgrader: [student, question, points]."""
         name, url = self.chapters[0], f"sqlite:///{self.out / 'gradebook.db'}"
         questions = [(cell.metadata.nbgrader.grade_id, cell.metadata.nbgrader.points) for cell in open_questions(released(name))]
@@ -315,32 +360,46 @@ class Semester:
             one for one, what in self.drawn(name).items() if what.get("answered") and what["kind"] in ("whole", "renamed")
         ]
         given = [[one, question, points / 2] for one in answered for question, points in questions][:BY_HAND]
+        assert given, f"{name}: nobody in this class has answered an open question"
         with Gradebook(url) as book:
             papers = {one: book.find_submission(name, one).notebooks[0].id for one, _, _ in given}
+            for student, question, points in () if browser else given:
+                book.find_grade(question, name, name, student).manual_score = points
+            book.db.commit()
+        if browser:
+            self._type(given, papers)
+        return given
+
+    def _type(self, given: list[list[Any]], papers: dict[str, str]) -> None:
+        from playwright.sync_api import TimeoutError, sync_playwright
+
         with formgrader(self.out) as address, sync_playwright() as playwright:
             browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
             page = browser.new_page()
             for student, question, points in given:
-                page.goto(f"{address}/formgrader/submissions/{papers[student]}")
-                field = page.locator(f"input.score[id={question}]")
-                field.wait_for(timeout=120_000)
-                with page.expect_response(
-                    lambda answer: "/api/grade/" in answer.url and answer.request.method == "PUT"
-                ) as answer:
-                    field.fill(f"{points:g}")
-                    field.press("Tab")
-                assert answer.value.ok, answer.value.status
+                for _ in range(5):  # what is typed before the page has its scripts, on a busy machine, is lost
+                    page.goto(f"{address}/formgrader/submissions/{papers[student]}", wait_until="networkidle", timeout=120_000)
+                    field = page.locator(f"input.score[id={question}]")
+                    field.wait_for(timeout=120_000)
+                    if field.input_value() == f"{points:g}":
+                        break
+                    with suppress(TimeoutError), page.expect_response(_is_put, timeout=20_000) as answer:
+                        field.fill(f"{points:g}")
+                        field.press("Tab")
+                        assert answer.value.ok, answer.value.status
+                else:
+                    raise AssertionError(f"formgrader does not keep what is typed for {student}, {question}")
             browser.close()
-        return given
 
     def accept(self) -> list[str]:
         """Make final what waits for a person: notebooks that had lost their metadata, and attacks that nobody can tell from accidents."""
-        accepted = []
+        kept = self.folder / "accepted.txt"  # a run that is stopped here goes on with the others
         for path in sorted(self.out.glob("verdicts/*/*.json")):
             if json.loads(path.read_text())["status"] == "needs_review":
                 self.course("accept", path.parent.name, path.stem, "--out", self.out, "--by", "teacher")
-                accepted.append(f"{path.parent.name} {path.stem}")
-        return accepted
+                with kept.open("a") as file:
+                    file.write(f"{path.parent.name} {path.stem}\n")
+        return sorted(set(kept.read_text().splitlines())) if kept.exists() else []
 
     def give_back(self) -> None:
         """What Canvas takes, by the name of each assignment, and nbgrader's own export, have every student's points."""
@@ -358,6 +417,23 @@ class Semester:
             returned = rows(self.out / "return" / "canvas" / f"{name}.csv") + rows(self.out / "return" / "canvas" / "canvas.csv")
             assert {row["ID"] for row in returned if row.get(name)} >= numbers, name
 
+    def live_through(self, browser: bool = True) -> None:
+        """All steps that were not done yet."""
+        first, every = self.chapters[0], range(len(self.sections))
+        for name in self.chapters:
+            for one in every:
+                self.step(f"hand in {name} {one}", functools.partial(self.hand_in, name, one))
+                self.step(f"collect {name} {one}", functools.partial(self.collect, name, one))
+                spoilt = self.spoilt if name == first else ""
+                self.step(f"grade {name} {one}", functools.partial(self.grade, name, one, spoilt))
+        self.step("by hand", functools.partial(self.by_hand, browser))
+        for one in every:
+            self.step(f"regrade {one}", functools.partial(self.grade, first, one))
+        self.step("accept", self.accept)
+        self.step("return and export", self.give_back)
+        for name in self.chapters:
+            self.as_drawn(name)
+
     def told(self, step: str) -> Any:
         return json.loads((self.folder / "steps" / f"{step}.json").read_text())["told"]
 
@@ -366,14 +442,17 @@ class Semester:
         kinds: dict[str, dict[str, float]] = {}
         for path in sorted((self.folder / "steps").glob("*.json")):
             cost = json.loads(path.read_text())
-            kind = kinds.setdefault(re.sub(r" ch\d+$", "", path.stem), {"minutes": 0.0, "peak_mb": 0.0})
-            kind["minutes"] = round(kind["minutes"] + cost["minutes"], 2)
+            nothing = {"minutes": 0.0, "processor_minutes": 0.0, "peak_mb": 0.0}
+            kind = kinds.setdefault(re.sub(r"( ch\d+)? \d+$", "", path.stem), nothing)
+            for name in ("minutes", "processor_minutes"):
+                kind[name] = round(kind[name] + cost[name], 2)
             kind["peak_mb"] = max(kind["peak_mb"], cost["peak_mb"])
         everybody = [what for name in self.chapters for what in self.drawn(name).values()]
         return {
             "students": len(self.students),
             "chapters": self.chapters,
             "jobs": self.jobs,
+            "cores": os.cpu_count(),
             "submissions": sum(what["kind"] != "absent" for what in everybody),
             "hostile": sum(what["kind"] == "hostile" for what in everybody),
             "broken": sum(what["kind"] in BROKEN and what["kind"] != "absent" for what in everybody),
@@ -384,10 +463,11 @@ class Semester:
             "disk_mb": {one: disk(self.folder / one) for one in ("canvas", "submitted", "grades")},
         }
 
-    def as_drawn(self, name: str, spoilt: str = "") -> None:
+    def as_drawn(self, name: str, spoilt: str = "", students: Sequence[str] = ()) -> None:
         """Every verdict of a chapter says what was drawn."""
         wrong = []
-        for student, submission in self.drawn(name).items():
+        for student in students or self.students:
+            submission = self.drawn(name)[student]
             path = self.out / "verdicts" / student / f"{name}.json"
             if submission["kind"] == "absent":
                 wrong += [f"{student}: a verdict on nothing"] if path.exists() else []
@@ -407,6 +487,10 @@ class Semester:
             if not fits:
                 wrong.append(f"{student}/{name}, {submission}: expected {expected}, found {verdict}")
         assert not wrong, "\n".join([f"{len(wrong)} are not as drawn", *wrong[:5]])
+
+
+def _is_put(answer: Any) -> bool:
+    return "/api/grade/" in answer.url and answer.request.method == "PUT"
 
 
 def open_questions(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
@@ -472,31 +556,48 @@ class Memory:
             self.peak = max(self.peak, total)
 
 
+def sentences(record: dict[str, Any]) -> str:
+    """What the teachers' page says of a semester, in its own lines."""
+    steps, jobs = record["steps"], record["jobs"]
+    return (
+        f"`tools/semester.py` simulates a semester: {record['students']} students and {len(record['chapters'])} chapters, with right "
+        f"answers, named mistakes, blanks, broken files and attacks, {record['submissions']} submissions in all.\n"
+        f"On {record['cores']} cores, with {jobs} job{'s' * (jobs > 1)}, grading took {steps['grade']['minutes']:.0f} minutes and "
+        f"{steps['grade']['peak_mb']:.0f} MB at the peak (proportional), and `grades/` {record['disk_mb']['grades']} MB; to grade "
+        f"a chapter again, once a check was mended, took {steps['regrade']['minutes']:.0f} minutes; every score was as drawn "
+        "(`tools/semester.json`).\n"
+    )
+
+
+def publish(record: dict[str, Any]) -> None:
+    """Write the record, and its figures onto the teachers' page."""
+    RECORD.write_text(json.dumps(record, indent=1) + "\n")
+    page = PAGE.read_text(encoding="utf-8")
+    written, count = re.subn(r"^`tools/semester\.py` simulates .*\n.*\n", lambda _: sentences(record), page, flags=re.M)
+    assert count == 1, f"{PAGE} has no place for the figures"
+    PAGE.write_text(written, encoding="utf-8")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--students", type=int, default=300)
-    parser.add_argument("--chapters", nargs="+", default=checks.assignments())
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--chapters", nargs="+", default=list(TEN), choices=checks.assignments())
+    which.add_argument("--all-chapters", dest="chapters", action="store_const", const=checks.assignments())
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--section", type=int, default=50, help="students whose work is collected and graded at a time")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--record", type=Path)
+    parser.add_argument("--without-browser", action="store_true")
+    parser.add_argument(
+        "--record", action="store_true", help="write tools/semester.json, and its figures onto the teachers' page"
+    )
     given = parser.parse_args()
-    semester = Semester(given.folder.resolve(), given.students, given.chapters, given.jobs, given.seed)
-    first = semester.chapters[0]
-    for name in semester.chapters:
-        semester.step(f"hand in {name}", lambda name=name: semester.hand_in(name))
-        semester.step(f"collect {name}", lambda name=name: semester.collect(name))
-        semester.step(f"grade {name}", lambda name=name: semester.grade(name, semester.spoilt if name == first else ""))
-    semester.step("by hand", semester.by_hand)
-    semester.step("regrade", lambda: semester.grade(first))
-    semester.step("accept", semester.accept)
-    semester.step("return and export", semester.give_back)
-    for name in semester.chapters:
-        semester.as_drawn(name)
-    text = json.dumps(semester.record(), indent=1) + "\n"
-    print(f"Every score is as drawn.\n{text}", end="")
+    semester = Semester(given.folder.resolve(), given.students, given.chapters, given.jobs, given.seed, given.section)
+    semester.live_through(browser=not given.without_browser)
+    print(f"Every score is as drawn.\n{json.dumps(semester.record(), indent=1)}")
     if given.record:
-        given.record.write_text(text)
+        publish(semester.record())
 
 
 if __name__ == "__main__":

@@ -103,7 +103,7 @@ def packages() -> dict[str, Path]:
 
 
 @functools.cache
-def _host_mounts() -> tuple[str, ...]:
+def host_mounts() -> tuple[str, ...]:
     """bwrap arguments: the interpreter, the packages and the system's libraries, read-only, at neutral paths."""
     base = Path(sys.base_prefix)
     library = Path("lib") / f"python{sys.version_info.major}.{sys.version_info.minor}"
@@ -150,17 +150,17 @@ def layers(course: Sequence[Path], files: Mapping[str, int], limits: Limits, fil
       filter_fd: descriptor of the seccomp program.
     Raises: FileNotFoundError if a program is missing; the text says how to install it.
     """
-    mounts = list(_host_mounts())
+    mounts = list(host_mounts())
     for path in course:
         mounts += ["--ro-bind", str(path.resolve()), f"/course/{path.name}"]
     sealed = [*_sealed(limits, files), "--seccomp", filter_fd]
     if os.geteuid() != 0:
-        return [([_tool("bwrap")], [*APART, *mounts, *sealed])]
+        return [([tool("bwrap")], [*APART, *mounts, *sealed])]
     again = [word for path in ("/python", "/site", "/course") for word in ("--ro-bind", path, path)]
     become_nobody = ["/tools/setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups", "--inh-caps=-all"]
-    tools = ["--dir", "/tools", *(word for tool in ("bwrap", "setpriv") for word in ("--ro-bind", _tool(tool), f"/tools/{tool}"))]
+    tools = ["--dir", "/tools", *(word for name in ("bwrap", "setpriv") for word in ("--ro-bind", tool(name), f"/tools/{name}"))]
     return [
-        ([_tool("bwrap")], [*_outer([*tools, *mounts]), "--die-with-parent"]),
+        ([tool("bwrap")], [*_outer([*tools, *mounts]), "--die-with-parent"]),
         ([*become_nobody, "/tools/bwrap"], [*again, *_system_libraries(), *LIBRARY_CACHE, *sealed]),
     ]
 
@@ -171,15 +171,15 @@ def around_server(course: Sequence[Path]) -> tuple[list[str], list[str]]:
     It sees what they may see; they seal themselves. It ends when the judge's end of its socket is shut, whichever thread started it,
     and where root starts it, it becomes nobody itself.
     """
-    mounts = list(_host_mounts())
+    mounts = list(host_mounts())
     for path in course:
         mounts += ["--ro-bind", str(path.resolve()), f"/course/{path.name}"]
     ending = ["--perms", "1777", "--tmpfs", "/tmp", "--dir", "/work", "--chdir", "/"]
     ending += [*_environment(), "--remount-ro", "/dev", "--remount-ro", "/"]
     if os.geteuid() == 0:
-        return [_tool("bwrap")], [*_outer(mounts), *ending]
+        return [tool("bwrap")], [*_outer(mounts), *ending]
     apart = ["--unshare-user", "--unshare-pid", *APART, "--uid", NOBODY, "--gid", NOBODY, "--cap-drop", "ALL", "--new-session"]
-    return [_tool("bwrap")], [*apart, "--clearenv", "--proc", "/proc", "--dev", "/dev", *mounts, *ending]
+    return [tool("bwrap")], [*apart, "--clearenv", "--proc", "/proc", "--dev", "/dev", *mounts, *ending]
 
 
 def _outer(mounts: Sequence[str]) -> list[str]:
@@ -224,7 +224,7 @@ def memory_file(data: bytes, passed: list[int]) -> int:
     return descriptor
 
 
-def _tool(name: str) -> str:
+def tool(name: str) -> str:
     path = shutil.which(name)
     if path is None:
         package = {"bwrap": "bubblewrap", "setpriv": "util-linux"}[name]

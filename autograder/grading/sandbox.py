@@ -15,6 +15,8 @@ Whatever fails before `script` starts is ours (`SandboxUnavailable`); whatever f
 `SandboxDied`, `SandboxGarbage`. After any of them the sandbox is of no use; close it.
 
 Use a Sandbox in the thread that opened it: bubblewrap's --die-with-parent follows that thread, not the process.
+
+The wall is bubblewrap's, on this machine's kernel; `wall="gvisor"` puts gVisor there instead, and all else is as said above.
 """
 
 import json
@@ -35,7 +37,7 @@ from pathlib import Path, PurePosixPath
 
 import psutil
 
-from autograder.grading import bubblewrap, forking, seccomp
+from autograder.grading import bubblewrap, forking, gvisor, seccomp
 from autograder.grading.bubblewrap import ENVIRONMENT, Limits, MiB
 from autograder.grading.forking import PYTHON_OPTIONS, ForkServer, Leash
 
@@ -44,6 +46,7 @@ MAX_FILES = 200  # each is an open descriptor of ours while the sandbox starts
 MAX_FILES_SIZE = 256 * MiB  # together; they lie in memory
 START_TIMEOUT = 60.0  # seconds until the interpreter runs; only an overloaded machine needs more than 0.2
 TICK = 0.2  # seconds between two looks at the memory
+WALLS = ("bubblewrap", "gvisor")
 
 # Runs first inside. Limits are set here, not outside, because RLIMIT_NPROC counts per user namespace and would count strangers
 # there. The one byte tells the judge that everything that is ours has worked.
@@ -128,6 +131,7 @@ class Sandbox:
       server: forks the process, instead of starting it anew; then `modules` are those that it was given, and the file system is laid
         out alike. The sandbox then lives as long as it is open, whatever becomes of the thread.
       trusted: run one's own code in an ordinary subprocess instead. Nothing is confined and no limit holds.
+      wall: one of WALLS. In gVisor nothing is forked by a server, and files and sockets count as the memory that they take.
 
     Raises: SandboxUnavailable on entering; ValueError for a file or a name that intake should have refused: not a regular
     file, not a plain relative name, more than MAX_FILES or MAX_FILES_SIZE.
@@ -141,7 +145,11 @@ class Sandbox:
         limits: Limits = Limits(),  # noqa: B008 (frozen)
         trusted: bool = False,
         server: ForkServer | None = None,
+        wall: str = "bubblewrap",
     ) -> None:
+        if wall not in WALLS:
+            raise ValueError(f"no wall is called {wall!r}: take one of {', '.join(WALLS)}")
+        self.wall = "" if trusted else wall
         self.script, self.modules, self.files = Path(script), [Path(module) for module in modules], dict(files or {})
         self.limits, self.trusted, self.server = limits, trusted, server
         for name in self.files:
@@ -172,7 +180,8 @@ class Sandbox:
                 except SandboxError as error:
                     self.close()
                     text = complaints.read(4000).decode(errors="replace").strip()
-                    raise SandboxUnavailable(bubblewrap.explain(text or str(error))) from None
+                    explain = gvisor.explain if self.wall == "gvisor" else bubblewrap.explain
+                    raise SandboxUnavailable(explain(text or str(error))) from None
                 if not self.trusted:
                     self._looked = 0.0
         except BaseException:
@@ -184,11 +193,12 @@ class Sandbox:
         self.close()
 
     def _start(self, channel: int, errors: int) -> None:
-        if self.server and not self.trusted:
+        if self.server and self.wall == "bubblewrap":
             self._process = self._forked(self.server, channel, errors)
             self._root = self._process.root
         else:
-            self._process = self._trusted(channel, errors) if self.trusted else self._sealed(channel, errors)
+            start = {"bubblewrap": self._sealed, "gvisor": self._in_gvisor}.get(self.wall, self._trusted)
+            self._process = start(channel, errors)
             self._root = psutil.Process(self._process.pid)
 
     def _sealed(self, channel: int, errors: int) -> subprocess.Popen:
@@ -213,6 +223,23 @@ class Sandbox:
         finally:
             for descriptor in passed[1:]:
                 os.close(descriptor)
+
+    def _in_gvisor(self, channel: int, errors: int) -> subprocess.Popen:
+        self._folder = tempfile.TemporaryDirectory(prefix="gvisor-")
+        opened: list[int] = []
+        # the limits are set by then: gVisor counts the processes of this one sandbox
+        boot = json.dumps([gvisor.CHANNEL, f"/course/{self.script.name}", ["/course", "/site", "/work"], {}])
+        try:
+            course, folder = [self.script, *self.modules], Path(self._folder.name)
+            command = gvisor.bundle(folder, course, self._opened(opened), self.limits, PYTHON_OPTIONS, BOOTSTRAP, boot)
+        except FileNotFoundError as error:
+            raise SandboxUnavailable(f"The sandbox does not start: {error}.") from error
+        finally:
+            for descriptor in opened:
+                os.close(descriptor)
+        return subprocess.Popen(
+            command, env={"PATH": gvisor.PATH}, cwd="/", stdin=channel, stdout=subprocess.DEVNULL, stderr=errors, start_new_session=True,
+        )  # fmt: skip
 
     def _forked(self, server: ForkServer, channel: int, errors: int) -> Leash:
         opened: list[int] = []
@@ -306,7 +333,8 @@ class Sandbox:
             self._looked = now
             tree, limits = self._tree(), self.limits
             memory = _memory(tree, limits.memory)
-            entries, sockets = (max(map(count, tree), default=0) for count in (_entries, _sockets))
+            counts = (_entries, _sockets) if self.wall == "bubblewrap" else ()  # elsewhere these are the host's
+            entries, sockets = [max(map(count, tree), default=0) for count in counts] or (0, 0)
             if memory > limits.memory or entries > limits.entries or sockets > limits.sockets:
                 self.close()
                 used = f"{memory // MiB} MiB, {entries} files and {sockets} sockets"
@@ -338,7 +366,8 @@ class Sandbox:
         if self._process is not None:
             tree = self._tree()
             # The kernel ends a whole namespace with its process 1, and bwrap, whose child that is, reaps it and exits.
-            for process in tree if self.trusted else tree[:1]:
+            first = tree[:1] if self.wall == "bubblewrap" else tree
+            for process in first:
                 with suppress(psutil.NoSuchProcess):
                     process.kill()
             if tree and not self.trusted:
@@ -349,7 +378,7 @@ class Sandbox:
             if isinstance(self._process, Leash):
                 self._process.close()
             if not self.trusted:
-                psutil.wait_procs(tree[:1], timeout=5)
+                psutil.wait_procs(first, timeout=5)
             self._process = self._root = None
         if self._socket is not None:
             self._socket.close()
@@ -410,7 +439,7 @@ socket.socket(fileno=int(sys.argv[1])).sendall(len(frame).to_bytes(8, "big") + f
 """
 
 
-def probe(torch: bool = False, server: ForkServer | None = None) -> list[Problem]:
+def probe(torch: bool = False, server: ForkServer | None = None, wall: str = "bubblewrap") -> list[Problem]:
     """What keeps a real sandbox, or one that `server` forks, from working here: nothing, if the list is empty.
 
     `torch` also imports torch inside (seconds).
@@ -420,10 +449,10 @@ def probe(torch: bool = False, server: ForkServer | None = None) -> list[Problem
         script.write_text(PROBE.format(torch=torch))
         script.chmod(0o644)  # where root grades, what runs inside is nobody, whatever root's umask
         try:
-            with Sandbox(script, server=server) as sandbox:
+            with Sandbox(script, server=server, wall=wall) as sandbox:
                 answer = sandbox.receive(timeout=START_TIMEOUT).decode()
         except SandboxUnavailable as error:
-            return [Problem("no sandbox", str(error))]
+            return [Problem("no sandbox" if wall == "bubblewrap" else "it does not start", str(error))]
         except SandboxError as error:
             return [
                 Problem(f"a program that starts inside the sandbox does not answer: {error}", "Try again; then tell the makers.")
@@ -434,7 +463,7 @@ def probe(torch: bool = False, server: ForkServer | None = None) -> list[Problem
     return []
 
 
-def require() -> None:
+def require(wall: str = "bubblewrap") -> None:
     """SandboxUnavailable, with one paragraph that says how to enable it, unless a sandbox starts on this machine."""
-    if problems := probe():
+    if problems := probe(wall=wall):
         raise SandboxUnavailable(problems[0].remedy)

@@ -22,6 +22,7 @@ import signal
 import socket
 import sys
 import threading
+import time
 from contextlib import suppress
 from dataclasses import asdict
 
@@ -126,13 +127,25 @@ def answer(channel: Channel, request: dict, namespace: dict, pools: list) -> Non
 
 def wait(child: int, seconds: float) -> str:
     """Wait for a child; kill it after `seconds`. Returns "" if it has answered, "timeout" or "exit"."""
-    handle = os.pidfd_open(child)
-    in_time = select.select([handle], [], [], seconds)[0]
+    in_time = ended_within(child, seconds)
     if not in_time:
         os.kill(child, signal.SIGKILL)
-    os.close(handle)
     _, status = os.waitpid(child, 0)
     return "timeout" if not in_time else "" if os.waitstatus_to_exitcode(status) == ANSWERED else "exit"
+
+
+def ended_within(child: int, seconds: float) -> bool:
+    """Wait for a child without reaping it."""
+    try:
+        handle = os.pidfd_open(child)
+    except OSError:  # a kernel that has no such handles, as gVisor's
+        until = time.monotonic() + seconds
+        while not (ended := os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT)) and time.monotonic() < until:
+            time.sleep(0.002)
+        return ended is not None
+    in_time = select.select([handle], [], [], seconds)[0]
+    os.close(handle)
+    return bool(in_time)
 
 
 def call(channel: Channel, request: dict, namespace: dict, pools: list) -> None:

@@ -554,13 +554,14 @@ def _entry(attempt: Attempt, number: int, rules: Deadlines, done: Collected, mar
     }
 
 
-def grader(timeout: float) -> tuple[Judge, Callable[[], str]]:
+def grader(timeout: float, wall: str = "bubblewrap") -> tuple[Judge, Callable[[], str]]:
     """What --best judges with: the sandboxed judge of `course grade`. Raises: sandbox.SandboxUnavailable."""
     from autograder import grade
     from autograder.grading import judge, sandbox
 
-    sandbox.require()
-    return (lambda student, assignment, folder: grade.judge_folder(student, assignment, folder, timeout)[0]), judge.environment
+    sandbox.require(wall)
+    judged = functools.partial(grade.judge_folder, timeout=timeout, wall=wall)
+    return (lambda student, assignment, folder: judged(student, assignment, folder)[0]), judge.environment
 
 
 # --- for people --------------------------------------------------------------------------------------------------------------

@@ -63,7 +63,7 @@ from jupyter_book.cli.main import main
 main(json.loads(sys.stdin.read()))
 """
 HOW_TO = ("how-to/learners", "how-to/teachers", "how-to/platforms", "how-to/contributors")
-APPENDICES = ("cheat-sheet", "notation", "kill-matrix", "practice", "atlas", "autograd", "format")
+APPENDICES = ("cheat-sheet", "notation", "kill-matrix", "threat-model", "practice", "atlas", "autograd", "format")
 MATHJAX = ("tex-chtml-full.js", "output/chtml/fonts/**/*", "a11y/*", "sre/**/*")
 
 __all__ = ["BookError", "build", "docname", "executed_outputs"]

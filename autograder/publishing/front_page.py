@@ -28,6 +28,7 @@ NOTES = {  # what a line of llms.txt says of the pages that are no chapters
     "cheat-sheet": "every loss and estimator of the book with its formula and shapes, on one page to print",
     "notation": "names and shapes, the same in chapters, library and plots",
     "kill-matrix": "for each exercise, the wrong answers that its check refuses and the right ones that it accepts",
+    "threat-model": "what the grader promises, against whom, which test proves it, and what is not promised",
     "practice": "which exercises a page can judge by itself, and how its verdicts were compared with the notebook's",
     "atlas": "what other libraries compute for the formulas of this book, number by number, and by which rule",
     "autograd": "how gradients are computed, on the code of the pages' own small torch",

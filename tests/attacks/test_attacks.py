@@ -31,7 +31,7 @@ def student(name):
     return getattr(importlib.import_module(f"tests.attacks.{name}.attack"), "STUDENT", name)
 
 
-def graded(folder, names, timeout):
+def graded(folder, names, timeout, *options):
     """(process, output folder, submitted folder) of one run."""
     submitted, out = folder / "submitted", folder / "out"
     for name in names:
@@ -42,7 +42,7 @@ def graded(folder, names, timeout):
     words = [sys.executable, "-m", "autograder", "grade", str(submitted), "--out", str(out), "--jobs", "2"]
     start = time.monotonic()
     process = subprocess.run(
-        [*words, "--timeout", str(timeout)],
+        [*words, "--timeout", str(timeout), *options],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT), "GRADER_SECRET": toolbox.CANARY},
         capture_output=True,

@@ -5,7 +5,7 @@ from nbformat.v4 import new_notebook
 from typer.testing import CliRunner
 
 from autograder import cli, grade
-from autograder.grading import sandbox
+from autograder.grading import gvisor, sandbox
 from autograder.grading.verdicts import Verdict
 from autograder.reporting import exports
 
@@ -37,12 +37,24 @@ def test_a_folder_without_submissions_says_what_it_looked_for(tmp_path):
 def test_without_a_sandbox_nothing_is_graded(tmp_path, monkeypatch):
     (tmp_path / "submitted" / "s1" / "ch44").mkdir(parents=True)
 
-    def unavailable():
+    def unavailable(wall):
         raise sandbox.SandboxUnavailable("bubblewrap is missing: apt install bubblewrap")
 
     monkeypatch.setattr(sandbox, "require", unavailable)
     result = run("grade", tmp_path / "submitted", "--out", tmp_path / "out")
     assert result.exit_code == 2 and "apt install bubblewrap" in result.output and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("command", [["grade"], ["collect", "--best", "--into", "somewhere"]])
+def test_a_wall_that_this_machine_lacks_is_named_and_no_other_is_used(tmp_path, monkeypatch, command):
+    (tmp_path / "submitted" / "s1" / "ch44").mkdir(parents=True)
+    monkeypatch.setattr(gvisor, "missing", lambda: "runsc is missing: install gVisor")
+    result = run(*command, tmp_path / "submitted", "--wall", "gvisor")
+    assert result.exit_code == 2 and "runsc is missing" in result.output
+    assert tuple(cli.Wall) == sandbox.WALLS
+    assert run("grade", tmp_path / "submitted", "--wall", "paper").exit_code == 2
+    both = run("grade", tmp_path / "submitted", "--wall", "gvisor", "--trust-submissions")
+    assert both.exit_code == 2 and "leave one of them out" in both.output
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from autograder import doctor
 from autograder.doctor import Check
-from autograder.grading import forking, sandbox
+from autograder.grading import forking, gvisor, sandbox
 
 
 def test_this_machine_works():
@@ -21,6 +21,7 @@ def test_this_machine_works():
         "MuJoCo",
         "sandbox",
         "fork server",
+        "wall",
         "flights",
         "nbgrader",
         "frozen checks",
@@ -66,6 +67,31 @@ def test_a_fork_server_that_does_not_work_is_told_and_not_required(monkeypatch):
         False,
         "user namespaces are switched off",
     ) and "longer" in check.remedy
+
+
+@pytest.mark.parametrize("server", [object(), None])
+def test_the_wall_in_use_is_told_and_why_it_is_not_the_stronger_one(monkeypatch, server):
+    monkeypatch.setattr(forking, "course", type("Shared", (), {"get": staticmethod(lambda: server)}))
+    monkeypatch.setattr(gvisor, "around", lambda: "")
+    used = "namespaces of its own, forked" if server else "bubblewrap, one process each"
+    monkeypatch.setattr(sandbox, "probe", lambda torch, wall: [])
+    assert doctor._wall() == Check("wall", True, f"{used}; the stronger one works, too: course grade --wall gvisor")
+    monkeypatch.setattr(sandbox, "probe", lambda torch, wall: [sandbox.Problem("runsc is missing", "apt install runsc")])
+    check = doctor._wall()
+    assert (check.ok, check.required) == (False, False)
+    assert check.detail == f"{used}; gVisor, the stronger one: runsc is missing" and "apt install runsc" in check.remedy
+
+
+def test_a_container_around_everything_is_told(monkeypatch, tmp_path):
+    monkeypatch.setattr(sandbox, "probe", lambda torch, wall: [])
+    monkeypatch.setattr(gvisor, "around", lambda: "a podman container")
+    assert "all of it in a podman container" in doctor._wall().detail
+    (tmp_path / "cmdline").write_text("BOOT_IMAGE=/vmlinuz-4.4.0-gvisor quiet\n")  # as gVisor's /proc has it
+    monkeypatch.undo()
+    assert gvisor.around(tmp_path / "cmdline") == "gVisor"
+    (tmp_path / ".dockerenv").touch()
+    assert gvisor.around(tmp_path / "none", tmp_path) == "a docker container"
+    assert gvisor.around(tmp_path / "none", tmp_path / "none") == ""
 
 
 def test_a_broken_sandbox_is_reported_with_its_remedy(monkeypatch):

@@ -94,7 +94,7 @@ class Warm:
         socket.send_fds(self._control, [json.dumps(asked).encode()], [descriptor])
         return _Forked(int(self._control.recv(100)))
 
-    def sandbox(self, script, modules=(), files=None, trusted=False):
+    def sandbox(self, script, modules=(), files=None, trusted=False, wall=""):
         return _Warm(self, script, modules, files)
 
 
@@ -103,11 +103,11 @@ class _Warm(Sandbox):
         super().__init__(script, modules, files, trusted=True)
         self._warm = warm
 
-    def _start_trusted(self, channel: int, errors: int) -> None:
+    def _trusted(self, channel: int, errors: int) -> _Forked:  # type: ignore[override]
         self._folder = tempfile.TemporaryDirectory(prefix="warm-", ignore_cleanup_errors=True)
         work = Path(self._folder.name)
         for name, path in self.files.items():
             (work / name).parent.mkdir(parents=True, exist_ok=True)
             (work / name).write_bytes(path.read_bytes())
         environment = {"HOME": str(work), "MPLCONFIGDIR": str(work)}
-        self._process = self._warm.fork(channel, work=str(work), script=str(self.script), environment=environment)  # type: ignore[assignment]
+        return self._warm.fork(channel, work=str(work), script=str(self.script), environment=environment)

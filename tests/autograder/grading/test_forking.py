@@ -251,7 +251,7 @@ def test_a_server_that_hangs_is_given_up_in_time(monkeypatch, tmp_path):
     server = shared.get()
     (tmp_path / "given").write_text("x")
     run = judge._Run.__new__(judge._Run)
-    run._trusted = False
+    run._trusted, run._wall = False, "bubblewrap"
     with process_of(server) as process, ExitStack() as stack:
         process.suspend()
         assert run._begun(stack, {"given": tmp_path / "given"}).server is None
@@ -382,7 +382,7 @@ def test_where_it_fails_the_judge_begins_anew(monkeypatch):
     shared = forking.Shared(lambda: ForkServer([], preload=("no_such_module",)))
     monkeypatch.setattr(forking, "course", shared)
     run = judge._Run.__new__(judge._Run)
-    run._trusted = False
+    run._trusted, run._wall = False, "bubblewrap"
     with ExitStack() as stack:
         box = run._begun(stack, {})
         assert box.server is None
@@ -395,7 +395,7 @@ def test_a_server_that_stops_working_is_given_up_and_what_it_has_forked_lives(mo
     server = shared.get()
     monkeypatch.setattr(server, "fork", lambda *_: (_ for _ in ()).throw(Refused("it does not answer")))
     run = judge._Run.__new__(judge._Run)
-    run._trusted = False
+    run._trusted, run._wall = False, "bubblewrap"
     for refusals in range(1, forking.PATIENCE + 1):
         with ExitStack() as stack:
             assert run._begun(stack, {}).server is None

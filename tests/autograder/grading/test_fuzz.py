@@ -1,4 +1,7 @@
-"""Notebooks and workers' answers that hypothesis makes up: each is read or refused in words, and no exercise loses its item."""
+"""Notebooks and workers' answers that hypothesis makes up: each is read or refused in words, and no exercise loses its item.
+
+tools/fuzz.py, which goes by what code a sample reaches, asks the same of its own.
+"""
 
 import json
 import os
@@ -101,6 +104,10 @@ def notebooks(draw):
 @BOUNDED
 @given(notebooks())
 def test_a_notebook_is_judged_or_refused_in_words(content):
+    judge_notebook(content)
+
+
+def judge_notebook(content):
     try:
         one = reading.read(content)
     except reading.BadNotebook as refusal:
@@ -155,6 +162,10 @@ class Talking:
 @BOUNDED
 @given(st.lists(FRAMES, min_size=1, max_size=4))
 def test_whatever_a_worker_says_each_exercise_has_a_finding_and_what_was_right_stays(frames):
+    judge_worker(frames)
+
+
+def judge_worker(frames):
     cells = reading.read(json.dumps(VALID).encode()).notebook
     run = judge._Run(intake.Submission("s", "ch99", Path("nowhere"), cells), RELEASE, 0.05, False)
     right = encode({"observations": [{"kind": "tensor", "outputs": {"": torch.ones(2)}}], "uses": []})

@@ -135,7 +135,7 @@ def _starting(*outcomes):
     left = list(outcomes)
 
     class Box:
-        def __init__(self, script, modules, files=None, trusted=False):
+        def __init__(self, script, modules, files=None, trusted=False, wall="bubblewrap"):
             self.files = dict(files or {})
 
         def __enter__(self):

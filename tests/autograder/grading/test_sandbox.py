@@ -145,8 +145,8 @@ def test_starting_costs_little_beside_the_interpreter(ask):
     """Nothing but the standard library is imported before the script, and the list of mounts is made once in a process."""
     foreign = "say(sorted({name.partition('.')[0] for name in sys.modules} - {'__main__'} - set(sys.stdlib_module_names)))"
     assert ask(foreign) == []
-    made = bubblewrap._host_mounts.cache_info().misses
-    assert ask(foreign) == [] and bubblewrap._host_mounts.cache_info().misses == made
+    made = bubblewrap.host_mounts.cache_info().misses
+    assert ask(foreign) == [] and bubblewrap.host_mounts.cache_info().misses == made
 
 
 def test_ipython_reads_cells_inside(ask):
@@ -735,13 +735,13 @@ def test_more_files_than_fit_are_refused(enter, tmp_path):
 
 def test_a_missing_package_is_ours_not_the_learners(enter_anew, monkeypatch):
     monkeypatch.setattr(bubblewrap, "LEARNER_PACKAGES", ("numpy", "no-such-package"))
-    for cached in (bubblewrap.packages, bubblewrap._host_mounts):
+    for cached in (bubblewrap.packages, bubblewrap.host_mounts):
         cached.cache_clear()
     try:
         with pytest.raises(SandboxUnavailable, match="no-such-package not installed"), enter_anew("say(1)"):
             pass
     finally:
-        for cached in (bubblewrap.packages, bubblewrap._host_mounts):
+        for cached in (bubblewrap.packages, bubblewrap.host_mounts):
             cached.cache_clear()
 
 
