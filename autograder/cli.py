@@ -249,6 +249,7 @@ def grade(
     from autograder import grade
     from autograder.grading import sandbox
     from autograder.proving.side_by_side import NoScheduler
+    from autograder.reporting import database
 
     left: list[str] = []
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -268,7 +269,10 @@ def grade(
             _stop(f"{error}. What is graded is kept; mend this and grade again.", BROKEN)
         except (OSError, SQLAlchemyError) as error:  # a full disk, most likely; Python's own exit status would mean low scores
             bar.stop()
-            _stop(f"the grades cannot be written: {error}. What is written is whole; mend this and grade again.", BROKEN)
+            _stop(
+                f"the grades cannot be written: {database.why(error)}. What is written is whole; mend this and grade again.",
+                BROKEN,
+            )
     from autograder.grading import verdicts
     from autograder.reporting import exports
 
@@ -303,6 +307,7 @@ def accept(
     from sqlalchemy.exc import SQLAlchemyError
 
     from autograder import grade
+    from autograder.reporting import database
 
     if not by:
         try:
@@ -314,7 +319,9 @@ def accept(
     except (grade.GradingError, ValueError) as error:
         _stop(error)
     except (OSError, SQLAlchemyError) as error:
-        _stop(f"the grades cannot be written: {error}. What is written is whole; mend this and accept again.", BROKEN)
+        _stop(
+            f"the grades cannot be written: {database.why(error)}. What is written is whole; mend this and accept again.", BROKEN
+        )
     print(f"{verdict.student}/{verdict.assignment}: {verdict.score:g} of {verdict.max_score:g} is final, accepted by {by}")
 
 
@@ -356,6 +363,7 @@ def give_back(
     from sqlalchemy.exc import SQLAlchemyError
 
     from autograder.platforms import give_back, returning
+    from autograder.reporting import database
 
     request = returning.Request(out, submitted, into, worksheet, tuple(only or ()), db_url, automatic, trust_submissions)
     try:
@@ -363,7 +371,9 @@ def give_back(
     except (give_back.GiveBackError, FileNotFoundError) as error:
         _stop(error)
     except (OSError, SQLAlchemyError) as error:
-        _stop(f"the files cannot be written: {error}. What is written is whole; mend this and return again.", BROKEN)
+        _stop(
+            f"the files cannot be written: {database.why(error)}. What is written is whole; mend this and return again.", BROKEN
+        )
     for path in given.files[:50]:
         print(path)
     if len(given.files) > 50:

@@ -8,77 +8,12 @@ import random
 import shutil
 import signal
 import subprocess
-import sys
 import time
-from pathlib import Path
 
 import pytest
 from nbgrader.api import Gradebook
 
-from tests.attacks import toolbox
-
-ROOT = Path(__file__).parents[2]
-CLASS = {"ann": 10.0, "bob": 8.0, "eve": 0.0}
-
-
-def command(submitted, out):
-    return [sys.executable, "-m", "autograder", "grade", str(submitted), "--out", str(out), "--jobs", "2", "--timeout", "20"]
-
-
-def start(submitted, out, **options):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    return subprocess.Popen(command(submitted, out), cwd=ROOT, env=environment, **pipes, **options)
-
-
-def grade(submitted, out):
-    process = start(submitted, out)
-    text = process.communicate(timeout=120)[0]
-    assert process.returncode == 0, text
-
-
-def results(out):
-    """What a run must agree on: all verdicts without their seconds, and the tables that hold none."""
-    verdicts = {}
-    for path in sorted(out.glob("verdicts/*/*.json")):
-        verdict = json.loads(path.read_text())
-        del verdict["seconds"]
-        verdicts[path.parent.name] = verdict
-    return verdicts, (out / "grades.csv").read_text(), (out / "questions.csv").read_text(), (out / "canvas.csv").read_text()
-
-
-def leftovers(out):
-    return [path for path in out.rglob("*") if path.name.endswith(".tmp")]
-
-
-def submit(folder, student):
-    target = folder / student / "ch44"
-    target.mkdir(parents=True)
-    notebook = toolbox.solved()
-    if student == "bob":
-        toolbox.wrong(notebook)
-    if student == "eve":
-        (target / "ch44.ipynb").write_text("no notebook")
-    else:
-        toolbox.write(target, notebook)
-
-
-@pytest.fixture(scope="module")
-def submitted(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("class") / "submitted"
-    for student in CLASS:
-        submit(folder, student)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def undisturbed(submitted, tmp_path_factory):
-    """(the folder of a run that nothing disturbed, how long it took)"""
-    out = tmp_path_factory.mktemp("undisturbed") / "grades"
-    began = time.monotonic()
-    grade(submitted, out)
-    assert {student: verdict["score"] for student, verdict in results(out)[0].items()} == CLASS
-    return out, time.monotonic() - began
+from tests.faults.runs import grade, leftovers, results, start
 
 
 def test_killed_at_any_moment_the_next_run_converges(submitted, undisturbed, tmp_path):
