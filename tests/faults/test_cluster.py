@@ -98,8 +98,13 @@ def no_wait_is_endless():
 
 @pytest.fixture
 def impatient(monkeypatch):
-    for name, seconds in {"PATIENCE": 5, "HIRING": 5, "LOOK": 1, "FETCH": 5}.items():
-        monkeypatch.setattr(side_by_side, name, seconds)
+    """Shortens waits, once it is called: on a busy machine those before need their time."""
+
+    def now(**seconds):
+        for name, value in seconds.items():
+            monkeypatch.setattr(side_by_side, name, value)
+
+    return now
 
 
 @pytest.fixture(scope="module")
@@ -195,6 +200,7 @@ def dumb():
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://nowhere", "127.0.0.1:port", "dumb"])
 def test_a_scheduler_that_is_not_there_is_one_line(submitted, tmp_path, impatient, dumb, address):
+    impatient(PATIENCE=2)
     address = dumb if address == "dumb" else address
     words = ["grade", str(submitted), "--out", str(tmp_path / "grades"), "--scheduler", address]
     result = CliRunner().invoke(cli.app, words)
@@ -216,6 +222,7 @@ def kept_line(cluster, submitted, local, tmp_path, at_first):
 @pytest.mark.parametrize("loss", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "silent"])
 def test_a_scheduler_that_stays_away_leaves_what_is_graded(cluster, submitted, local, tmp_path, impatient, loss):
     def lose():
+        impatient(PATIENCE=5, LOOK=1, FETCH=5)
         cluster.scheduler.send_signal(loss)
 
     try:
@@ -227,6 +234,7 @@ def test_a_scheduler_that_stays_away_leaves_what_is_graded(cluster, submitted, l
 
 def test_a_scheduler_without_workers_is_not_waited_for_without_end(cluster, submitted, local, tmp_path, impatient):
     def lose():
+        impatient(HIRING=5, LOOK=2)
         for worker in cluster.workers:
             worker.kill()
 
