@@ -225,7 +225,10 @@ def grade(
     jobs: Annotated[int, typer.Option(min=1, help="Submissions judged at a time.")] = os.cpu_count() or 1,
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler, tcp://…, instead of --jobs.")] = None,
     timeout: Annotated[float, typer.Option(min=0.1, help="Seconds for each exercise, and for loading a notebook.")] = 60.0,
-    db_url: Annotated[str | None, typer.Option(help="nbgrader's gradebook; sqlite:///OUT/gradebook.db by default.")] = None,
+    db_url: Annotated[
+        str | None,
+        typer.Option(help="nbgrader's gradebook, such as postgresql://me@host/course; sqlite:///OUT/gradebook.db by default."),
+    ] = None,
     fail_under: Annotated[
         float | None, typer.Option(min=0.0, max=1.0, help="Exit with 1 if a submission scores less than this share.")
     ] = None,
@@ -353,7 +356,10 @@ def give_back(
     automatic: Annotated[
         bool, typer.Option("--automatic", help="Moodle: automatic points alone, without those by hand.")
     ] = False,
-    db_url: Annotated[str | None, typer.Option(help="nbgrader's gradebook; sqlite:///OUT/gradebook.db by default.")] = None,
+    db_url: Annotated[
+        str | None,
+        typer.Option(help="nbgrader's gradebook, such as postgresql://me@host/course; sqlite:///OUT/gradebook.db by default."),
+    ] = None,
     trust_submissions: Annotated[
         bool,
         typer.Option("--trust-submissions", help="Gradescope: an archive that grades WITHOUT a sandbox. For your own code only."),

@@ -154,8 +154,11 @@ def graded(submitted, out, scheduler, at_first=lambda: None):
     return results(out)
 
 
-def test_two_workers_give_the_grades_of_a_local_run(cluster, submitted, local, tmp_path):
+def test_two_workers_share_the_work_and_give_the_grades_of_a_local_run(cluster, submitted, local, tmp_path):
     assert graded(submitted, tmp_path / "grades", cluster.address) == local
+    with Client(cluster.address) as client:
+        shares = client.run(lambda dask_worker: dask_worker.state.executed_count)
+    assert sum(shares.values()) == len(STUDENTS) + 1 and min(shares.values()) >= 2
 
 
 def test_a_worker_that_falls_silent_and_comes_back_delivers_nothing_twice(cluster, submitted, local, tmp_path):
