@@ -233,7 +233,10 @@ def grade(
     jobs: Annotated[int, typer.Option(min=1, help="Submissions judged at a time.")] = os.cpu_count() or 1,
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler, tcp://…, instead of --jobs.")] = None,
     timeout: Annotated[float, typer.Option(min=0.1, help="Seconds for each exercise, and for loading a notebook.")] = 60.0,
-    db_url: Annotated[str | None, typer.Option(help="nbgrader's gradebook; sqlite:///OUT/gradebook.db by default.")] = None,
+    db_url: Annotated[
+        str | None,
+        typer.Option(help="nbgrader's gradebook, such as postgresql://me@host/course; sqlite:///OUT/gradebook.db by default."),
+    ] = None,
     fail_under: Annotated[
         float | None, typer.Option(min=0.0, max=1.0, help="Exit with 1 if a submission scores less than this share.")
     ] = None,
@@ -262,6 +265,7 @@ def grade(
     from autograder import grade
     from autograder.grading import sandbox
     from autograder.proving.side_by_side import NoScheduler
+    from autograder.reporting import database
 
     left: list[str] = []
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -281,7 +285,10 @@ def grade(
             _stop(f"{error}. What is graded is kept; mend this and grade again.", BROKEN)
         except (OSError, SQLAlchemyError) as error:  # a full disk, most likely; Python's own exit status would mean low scores
             bar.stop()
-            _stop(f"the grades cannot be written: {error}. What is written is whole; mend this and grade again.", BROKEN)
+            _stop(
+                f"the grades cannot be written: {database.why(error)}. What is written is whole; mend this and grade again.",
+                BROKEN,
+            )
     from autograder.grading import verdicts
     from autograder.reporting import exports
 
@@ -316,6 +323,7 @@ def accept(
     from sqlalchemy.exc import SQLAlchemyError
 
     from autograder import grade
+    from autograder.reporting import database
 
     if not by:
         try:
@@ -327,7 +335,9 @@ def accept(
     except (grade.GradingError, ValueError) as error:
         _stop(error)
     except (OSError, SQLAlchemyError) as error:
-        _stop(f"the grades cannot be written: {error}. What is written is whole; mend this and accept again.", BROKEN)
+        _stop(
+            f"the grades cannot be written: {database.why(error)}. What is written is whole; mend this and accept again.", BROKEN
+        )
     print(f"{verdict.student}/{verdict.assignment}: {verdict.score:g} of {verdict.max_score:g} is final, accepted by {by}")
 
 
@@ -359,7 +369,10 @@ def give_back(
     automatic: Annotated[
         bool, typer.Option("--automatic", help="Moodle: automatic points alone, without those by hand.")
     ] = False,
-    db_url: Annotated[str | None, typer.Option(help="nbgrader's gradebook; sqlite:///OUT/gradebook.db by default.")] = None,
+    db_url: Annotated[
+        str | None,
+        typer.Option(help="nbgrader's gradebook, such as postgresql://me@host/course; sqlite:///OUT/gradebook.db by default."),
+    ] = None,
     trust_submissions: Annotated[
         bool,
         typer.Option("--trust-submissions", help="Gradescope: an archive that grades WITHOUT a sandbox. For your own code only."),
@@ -369,6 +382,7 @@ def give_back(
     from sqlalchemy.exc import SQLAlchemyError
 
     from autograder.platforms import give_back, returning
+    from autograder.reporting import database
 
     request = returning.Request(out, submitted, into, worksheet, tuple(only or ()), db_url, automatic, trust_submissions)
     try:
@@ -376,7 +390,9 @@ def give_back(
     except (give_back.GiveBackError, FileNotFoundError) as error:
         _stop(error)
     except (OSError, SQLAlchemyError) as error:
-        _stop(f"the files cannot be written: {error}. What is written is whole; mend this and return again.", BROKEN)
+        _stop(
+            f"the files cannot be written: {database.why(error)}. What is written is whole; mend this and return again.", BROKEN
+        )
     for path in given.files[:50]:
         print(path)
     if len(given.files) > 50:

@@ -72,8 +72,9 @@ def grade(
       left_over: called with a line for each thing in `submitted` that was not understood: what was seen, and what it would take.
 
     Returns: the verdicts of this run, sorted by student and assignment.
-    Raises: GradingError if there is nothing to grade; sandbox.SandboxUnavailable if no sandbox can be had; side_by_side.NoScheduler if
-      there is no scheduler, or none any more; OtherWorker if a worker lacks the files or has other checks.
+    Raises: GradingError if there is nothing to grade, or `db_url` is none; sandbox.SandboxUnavailable if no sandbox can be had;
+      side_by_side.NoScheduler if there is no scheduler, or none any more; OtherWorker if a worker lacks the files or has other checks;
+      OSError or SQLAlchemyError if a disk or a database refuses.
     """
     tasks = _tasks(submitted, left_over)
     rules = _deadlines(submitted, due)
@@ -86,10 +87,22 @@ def grade(
                 forking.course.begin()
             sandbox.require(wall)
     out.mkdir(parents=True, exist_ok=True)
+    _try_database(db_url)
     judging = _on_dask(tasks, scheduler, timeout, wall) if scheduler else _here(tasks, jobs, timeout, trusted, wall)
     with _one_run_at_a_time(out), judging as judged:
         sources.remember(out, submitted)
         return _write_all(tasks, judged, out, db_url, progress, rules)
+
+
+def _try_database(db_url: str | None) -> None:
+    """One that a teacher has named may refuse, which is better told before anything is judged."""
+    from autograder.reporting import database
+
+    try:
+        if db_url:
+            database.try_it(db_url)
+    except database.UnusableURL as error:
+        raise GradingError(str(error)) from None
 
 
 def _deadlines(submitted: Path, due: Path | None) -> Deadlines:

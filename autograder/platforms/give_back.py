@@ -15,6 +15,7 @@ from autograder.grading import sources
 from autograder.grading.verdicts import FINAL, Verdict, clean_text, read_all
 from autograder.reporting import collected
 from autograder.reporting.collected import Handed
+from autograder.reporting.database import UnusableURL
 from autograder.reporting.gradebook import GradebookWriter, Mark
 from autograder.reporting.report import STATE_WORDS, points
 from autograder.reporting.tables import Person, person
@@ -143,7 +144,11 @@ def load(grades: Path, submitted: Path | None, db_url: str | None = None, only: 
     if unknown:
         known = ", ".join(sorted({verdict.assignment for verdict in verdicts}))
         raise GiveBackError(f"nothing of {', '.join(sorted(unknown))} was graded in {grades}; there is {known}")
-    with GradebookWriter(db_url or f"sqlite:///{(grades / 'gradebook.db').resolve()}") as book:
+    try:
+        writer = GradebookWriter(db_url or f"sqlite:///{(grades / 'gradebook.db').resolve()}")
+    except UnusableURL as error:
+        raise GiveBackError(str(error)) from None
+    with writer as book:
         marks = book.marks()
         rows = {(row["student_id"], row["assignment"]): row for row in book.grades()}
     results, given = [], Given()

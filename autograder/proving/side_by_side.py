@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, as_completed
-from contextlib import suppress
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import get_context
-from typing import TYPE_CHECKING, Generic, TypeVar
+from queue import Empty, Queue
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from experiments import pool
 
@@ -18,11 +21,14 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 PATIENCE = 30  # seconds that a scheduler may be away, at the start or later
-ROUNDS = 3
+HIRING = 120  # seconds that a scheduler may be without any worker
+LOOK = 5  # seconds without news, after which it is looked whether somebody works
+FETCH = 30  # seconds that a worker may take to hand over a result
+ROUNDS = 3  # times that all may be lost
 
 
 class NoScheduler(OSError):
-    """No scheduler answers, or not any more."""
+    """No scheduler answers, or not any more, or it has no workers."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,7 @@ def run(
       scheduler: address of a Dask scheduler whose workers share this file system; replaces `jobs`.
 
     Yields: a Done for each item, in the order of ending. A function that raises costs its own item only.
-    Raises: NoScheduler if none answers at that address, or none any more, for PATIENCE seconds.
+    Raises: NoScheduler if none answers at that address, or none any more, for PATIENCE seconds, or it has no worker for HIRING.
     """
     if scheduler:
         yield from _on_dask(function, items, scheduler)
@@ -71,36 +77,100 @@ def _here(function: Callable[[Item], Result], items: Sequence[Item], jobs: int) 
 
 
 def _on_dask(function: Callable[[Item], Result], items: Sequence[Item], scheduler: str) -> Iterator[Done[Item, Result]]:
-    """Every item ends once, however often the cluster runs it; what a scheduler took with it is handed to the next one."""
-    from distributed import as_completed as as_they_end  # a second of imports that a local run need not pay
-
+    """Every item ends once, however often the cluster runs it; what a scheduler or a worker took with it is handed out again."""
     left, fruitless = dict(enumerate(items)), 0
     while left:
         before = len(left)
         with _client(scheduler) as client:
-            futures = {client.submit(function, item, pure=False, retries=1): number for number, item in left.items()}
-            for future in as_they_end(futures):
-                with suppress(CancelledError):  # the scheduler is gone, and knows nothing of it when it is back
-                    done: Done[Item, Result] = _done(left[futures[future]], future)
-                    del left[futures[future]]
-                    yield done
+            for number, done in _as_they_end(client, function, left, scheduler):
+                del left[number]
+                yield done
         fruitless = fruitless + 1 if len(left) == before else 0
         if left and fruitless == ROUNDS:
-            raise NoScheduler(f"the Dask scheduler at {scheduler} was lost {ROUNDS} times before anything had come of it")
+            raise NoScheduler(
+                f"the Dask scheduler at {scheduler} or its workers were lost {ROUNDS} times before anything had come of it"
+            )
 
 
-def _client(scheduler: str) -> Client:
+def _as_they_end(
+    client: Client, function: Callable[[Item], Result], left: Mapping[int, Item], scheduler: str
+) -> Iterator[tuple[int, Done[Item, Result]]]:
+    """What ends while this scheduler lives. Nothing here waits without limit: a worker may be gone, or say nothing, at any moment."""
+    ended: Queue[Any] = Queue()
+    waiting = {client.submit(function, item, pure=False, retries=1): number for number, item in left.items()}
+    for future in waiting:
+        future.add_done_callback(ended.put)
+    alive = _Alive(client, scheduler)
+    while waiting:
+        try:
+            future = ended.get(timeout=LOOK)
+        except Empty:
+            if alive.lost():
+                return
+            continue
+        number = waiting.pop(future)
+        try:
+            done: Done[Item, Result] = _done(left[number], future, FETCH)
+        except (OSError, CancelledError):  # who held the result is gone, or says nothing: it is made again in the next round
+            continue
+        yield number, done
+
+
+class _Alive:
+    """Looks whether somebody is there to work."""
+
+    def __init__(self, client: Client, scheduler: str) -> None:
+        self._client, self._scheduler = client, scheduler
+        self._answered = self._worked = time.monotonic()
+
+    def lost(self) -> bool:
+        """Whether the scheduler has not answered for PATIENCE seconds. Raises: NoScheduler if it had no worker for HIRING seconds."""
+        now = time.monotonic()
+        asked = self._client.scheduler
+        if asked is None:  # the client has given it up by itself
+            return True
+        try:
+            workers = self._client.sync(asked.ncores, callback_timeout=LOOK)
+        except (OSError, TimeoutError):
+            return now - self._answered > PATIENCE
+        self._answered = now
+        if workers:
+            self._worked = now
+        elif now - self._worked > HIRING:
+            raise NoScheduler(
+                f"no worker has joined {self._scheduler} for {HIRING} s: start one with `dask worker {self._scheduler}`"
+            )
+        return False
+
+
+@contextmanager
+def _client(scheduler: str) -> Iterator[Client]:
     """Raises NoScheduler if none answers in time."""
-    from distributed import Client
+    from distributed import Client  # a second of imports that a local run need not pay
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # that a connection is lost is told in one line of ours
     try:
-        return Client(scheduler, timeout=PATIENCE)
+        with ThreadPoolExecutor(1) as aside:  # apart from any event loop of this thread
+            aside.submit(asyncio.run, _greet(scheduler)).result()
+        client = Client(scheduler, timeout=PATIENCE)
     except (OSError, ValueError) as error:
         reason = f"none answered within {PATIENCE} s" if isinstance(error, OSError) else str(error)
         raise NoScheduler(f"no Dask scheduler at {scheduler}: {reason}") from error
+    try:
+        yield client
+    finally:
+        with suppress(OSError):  # from one that says nothing, no farewell is waited for
+            client.close(timeout=LOOK)
 
 
-def _done(item: Item, future: Future) -> Done[Item, Result]:
-    error = future.exception()
-    return Done(item, None if error else future.result(), error)
+async def _greet(scheduler: str) -> None:
+    """Returns when the scheduler has answered once; a Client would wait without limit for one that takes the call and says nothing."""
+    from distributed.core import rpc
+
+    async with asyncio.timeout(PATIENCE), rpc(scheduler, timeout=PATIENCE) as called:
+        await called.identity()
+
+
+def _done(item: Item, future: Future, patience: float | None = None) -> Done[Item, Result]:
+    error = future.exception(patience)
+    return Done(item, None if error else future.result(patience), error)

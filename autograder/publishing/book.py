@@ -62,7 +62,7 @@ import jupyter_book.sphinx, myst_nb.sphinx_ext, sphinx_book_theme, sphinxcontrib
 from jupyter_book.cli.main import main
 main(json.loads(sys.stdin.read()))
 """
-HOW_TO = ("how-to/learners", "how-to/teachers", "how-to/platforms", "how-to/contributors")
+HOW_TO = ("how-to/learners", "how-to/teachers", "how-to/platforms", "how-to/cluster", "how-to/contributors")
 APPENDICES = ("cheat-sheet", "notation", "kill-matrix", "threat-model", "practice", "atlas", "autograd", "format")
 MATHJAX = ("tex-chtml-full.js", "output/chtml/fonts/**/*", "a11y/*", "sre/**/*")
 

@@ -24,6 +24,7 @@ NOTES = {  # what a line of llms.txt says of the pages that are no chapters
     "how-to/learners": "answering exercises on the page and in the notebook, what checks say, a prompt for a tutor",
     "how-to/teachers": "releasing notebooks, collecting and grading them, deadlines, work that is alike",
     "how-to/platforms": "from and to Canvas, Moodle, Gradescope, Blackboard, GitHub and nbgrader's exchange",
+    "how-to/cluster": "grading on several machines: Dask, SLURM, Kubernetes, and what happens when one is lost",
     "how-to/contributors": "adding a chapter, its reference and its checks",
     "cheat-sheet": "every loss and estimator of the book with its formula and shapes, on one page to print",
     "notation": "names and shapes, the same in chapters, library and plots",

@@ -3,9 +3,8 @@
 nbgrader's own tables and models (0.9.6) are used as they are; only the transactions are ours. Its API commits after every row,
 so that a kill leaves half a submission; here each submission is one transaction, and so is the creation of the database. What
 teachers type (manual scores, extra credit, comments, names) is never written, due dates and penalties only from a file of them. One
-table is ours, `course_accepted`: who made a provisional score final, when and why (`course accept`). SQLite runs with a write-ahead
-log, in which readers such as formgrader never block the writer; the log needs a local disk. Other databases work by their SQLAlchemy
-URL.
+table is ours, `course_accepted`: who made a provisional score final, when and why (`course accept`). Which database it is, and how several
+graders take turns in it, is for `database`.
 """
 
 from __future__ import annotations
@@ -48,12 +47,9 @@ from sqlalchemy import (
     Table,
     Text,
     and_,
-    create_engine,
     delete,
-    event,
     func,
     inspect,
-    make_url,
     select,
     text,
     true,
@@ -62,10 +58,10 @@ from sqlalchemy.orm import Session, aliased
 
 from autograder.grading.deadlines import UNKNOWN, HandedIn
 from autograder.grading.verdicts import Item, Verdict, plain_name, write_atomically
-from autograder.reporting import passive
+from autograder.reporting import database, passive
 
 COURSE = "default_course"  # nbgrader's own name for the course of a folder that names none
-BUSY_SECONDS = 60
+NAME_LENGTH = 255
 GRADE_COLUMNS = (
     "assignment", "duedate", "timestamp", "student_id", "last_name", "first_name", "email",
     "raw_score", "late_submission_penalty", "score", "max_score",
@@ -111,8 +107,8 @@ class Acceptance:
 _ACCEPTED = Table(
     "course_accepted",
     MetaData(),
-    Column("student", String(255), primary_key=True),
-    Column("assignment", String(255), primary_key=True),
+    Column("student", String(NAME_LENGTH), primary_key=True),
+    Column("assignment", String(NAME_LENGTH), primary_key=True),
     Column("submission", String(64), nullable=False),
     Column("accepted_by", Text, nullable=False),
     Column("accepted_on", String(32), nullable=False),
@@ -123,27 +119,11 @@ _ACCEPTED = Table(
 # --- the database ------------------------------------------------------------------------------------------------------------
 
 
-def _engine(db_url: str | URL):
-    engine = create_engine(db_url)
-    if engine.dialect.name == "sqlite":
-
-        @event.listens_for(engine, "connect")
-        def _prepare(connection, _record):
-            connection.isolation_level = None  # the driver would begin transactions late, and only before writes
-            connection.execute(f"PRAGMA busy_timeout = {BUSY_SECONDS * 1000}")
-            connection.execute("PRAGMA journal_mode = WAL")
-
-        @event.listens_for(engine, "begin")
-        def _begin(connection):
-            # One that reads first and writes later is refused at once, without waiting, when another has written meanwhile.
-            connection.exec_driver_sql("BEGIN IMMEDIATE")
-
-    return engine
-
-
 def _create_schema(connection) -> None:
     """What nbgrader's Gradebook does on its first visit, in one transaction and without a subprocess."""
     Base.metadata.create_all(connection)
+    if connection.dialect.name == "postgresql":
+        _widen_names(connection)
     if not inspect(connection).has_table("alembic_version"):
         config = Config()
         config.set_main_option("script_location", ALEMBIC_DIR.replace("%", "%%"))
@@ -152,6 +132,14 @@ def _create_schema(connection) -> None:
         connection.execute(text("INSERT INTO alembic_version (version_num) VALUES (:version)"), {"version": version})
     if not connection.execute(select(Course.id).where(Course.id == COURSE)).first():
         connection.execute(Course.__table__.insert().values(id=COURSE))
+
+
+def _widen_names(connection) -> None:
+    """PostgreSQL keeps to nbgrader's 128 characters for a student, SQLite never did, and a folder's name may have more."""
+    for table, column in (("student", "id"), ("submitted_assignment", "student_id")):
+        [found] = (one for one in inspect(connection).get_columns(table) if one["name"] == column)
+        if found["type"].length < NAME_LENGTH:
+            connection.execute(text(f"ALTER TABLE {table} ALTER COLUMN {column} TYPE VARCHAR({NAME_LENGTH})"))
 
 
 def _get_or_add(db: Session, model: Any, **key: Any) -> Any:
@@ -194,7 +182,7 @@ class GradebookWriter:
     """Writes automatic scores into the database at `db_url`, which is created on first use. A context manager."""
 
     def __init__(self, db_url: str | URL):
-        self._engine = _engine(db_url)
+        self._engine = database.engine(db_url)
         with self._engine.begin() as connection:
             _create_schema(connection)
 
@@ -481,12 +469,12 @@ def write_course(directory: Path, releases: Mapping[str, NotebookNode], db_url: 
     `db_url` is needed only for a database other than `directory/gradebook.db`. Its password is left out, as others may read
     the file; PostgreSQL's client finds passwords in ~/.pgpass.
     """
-    database = ""
+    where = ""
     if db_url:
-        url = make_url(db_url)
+        url = database.address(db_url).difference_update_query(["password"])
         public = URL.create(url.drivername, url.username, None, url.host, url.port, url.database, url.query)
-        database = f"c.CourseDirectory.db_url = {public.render_as_string()!r}\n"
-    write_atomically(Path(directory) / "nbgrader_config.py", _CONFIG.format(database=database))
+        where = f"c.CourseDirectory.db_url = {public.render_as_string()!r}\n"
+    write_atomically(Path(directory) / "nbgrader_config.py", _CONFIG.format(database=where))
     for assignment, release in releases.items():
         plain_name(assignment)
         write_atomically(Path(directory) / "source" / assignment / f"{assignment}.ipynb", nbformat.writes(release) + "\n")

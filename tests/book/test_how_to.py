@@ -125,9 +125,9 @@ def reader(tmp_path, monkeypatch):
     programs, folder = tmp_path / "bin", tmp_path / "work"
     programs.mkdir()
     folder.mkdir()
-    course = programs / "course"
-    course.write_text(f'#!/bin/sh\nPYTHONPATH="{ROOT}" exec "{sys.executable}" -m autograder "$@"\n')
-    course.chmod(0o755)
+    for name, module in {"course": "autograder", "dask": "dask"}.items():
+        (programs / name).write_text(f'#!/bin/sh\nPYTHONPATH="{ROOT}" exec "{sys.executable}" -m {module} "$@"\n')
+        (programs / name).chmod(0o755)
     kept = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "FORCE_COLOR")}
     path = os.pathsep.join([str(programs), str(Path(sys.executable).parent), os.environ["PATH"]])
     environment = kept | {"PATH": path, "COLUMNS": "90", "LC_ALL": "C.UTF-8", "PYTHONPATH": str(folder / "course_lib")}
@@ -150,6 +150,13 @@ def test_the_teachers_page(reader, html):  # the built book, since a first relea
 def test_the_platforms_page(reader):
     page = reader("platforms")
     release.release(page.folder / "release", ["ch44"])
+    page.run()
+
+
+def test_the_cluster_page(reader):
+    page = reader("cluster")
+    release.release(page.folder / "release", ["ch44"])
+    shutil.copy(ROOT / "tools" / "cluster" / "slurm.py", page.folder)
     page.run()
 
 

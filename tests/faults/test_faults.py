@@ -8,77 +8,12 @@ import random
 import shutil
 import signal
 import subprocess
-import sys
 import time
-from pathlib import Path
 
 import pytest
 from nbgrader.api import Gradebook
 
-from tests.attacks import toolbox
-
-ROOT = Path(__file__).parents[2]
-CLASS = {"ann": 10.0, "bob": 8.0, "eve": 0.0}
-
-
-def command(submitted, out):
-    return [sys.executable, "-m", "autograder", "grade", str(submitted), "--out", str(out), "--jobs", "2", "--timeout", "20"]
-
-
-def start(submitted, out, **options):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    return subprocess.Popen(command(submitted, out), cwd=ROOT, env=environment, **pipes, **options)
-
-
-def grade(submitted, out):
-    process = start(submitted, out)
-    text = process.communicate(timeout=120)[0]
-    assert process.returncode == 0, text
-
-
-def results(out):
-    """What a run must agree on: all verdicts without their seconds, and the tables that hold none."""
-    verdicts = {}
-    for path in sorted(out.glob("verdicts/*/*.json")):
-        verdict = json.loads(path.read_text())
-        del verdict["seconds"]
-        verdicts[path.parent.name] = verdict
-    return verdicts, (out / "grades.csv").read_text(), (out / "questions.csv").read_text(), (out / "canvas.csv").read_text()
-
-
-def leftovers(out):
-    return [path for path in out.rglob("*") if path.name.endswith(".tmp")]
-
-
-def submit(folder, student):
-    target = folder / student / "ch44"
-    target.mkdir(parents=True)
-    notebook = toolbox.solved()
-    if student == "bob":
-        toolbox.wrong(notebook)
-    if student == "eve":
-        (target / "ch44.ipynb").write_text("no notebook")
-    else:
-        toolbox.write(target, notebook)
-
-
-@pytest.fixture(scope="module")
-def submitted(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("class") / "submitted"
-    for student in CLASS:
-        submit(folder, student)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def undisturbed(submitted, tmp_path_factory):
-    """(the folder of a run that nothing disturbed, how long it took)"""
-    out = tmp_path_factory.mktemp("undisturbed") / "grades"
-    began = time.monotonic()
-    grade(submitted, out)
-    assert {student: verdict["score"] for student, verdict in results(out)[0].items()} == CLASS
-    return out, time.monotonic() - began
+from tests.faults.runs import grade, leftovers, refused, results, start, verdicts
 
 
 def test_killed_at_any_moment_the_next_run_converges(submitted, undisturbed, tmp_path):
@@ -106,27 +41,58 @@ def test_two_runs_on_one_folder_converge(submitted, undisturbed, tmp_path):
 
 @pytest.fixture
 def small_disk(tmp_path):
-    """A file system of its own with room for the gradebook and not for the rest; needs root."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", str(disk)]
-    if os.geteuid() != 0 or subprocess.run(mount, capture_output=True).returncode:
-        pytest.skip("mounting a small file system needs root")
-    yield disk
-    subprocess.run(["umount", "-l", str(disk)], check=True)
+    """Makes a folder a file system of its own, with so much room; needs root."""
+    mounted = []
+
+    def mount(folder, size):
+        folder.mkdir(parents=True)
+        words = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+        if os.geteuid() != 0 or subprocess.run(words, capture_output=True).returncode:
+            pytest.skip("mounting a small file system needs root")
+        mounted.append(folder)
+        return folder
+
+    yield mount
+    for folder in mounted:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
-def test_on_a_full_disk_it_fails_aloud_and_with_room_it_converges(submitted, undisturbed, small_disk):
-    process = start(submitted, small_disk / "grades")
-    text = process.communicate(timeout=120)[0]
-    assert process.returncode == 3 and "Traceback" not in text, text
-    assert "space" in text or "full" in text
-    for path in small_disk.glob("grades/verdicts/*/*.json"):
-        json.loads(path.read_text())
-    subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
-    grade(submitted, small_disk / "grades")
-    assert results(small_disk / "grades") == results(undisturbed[0])
-    assert not leftovers(small_disk / "grades")
+def enlarge(disk):
+    subprocess.run(["mount", "-o", "remount,size=64m", str(disk)], check=True)
+
+
+def test_on_a_full_disk_it_fails_aloud_and_with_room_it_converges(submitted, undisturbed, small_disk, tmp_path):
+    disk = small_disk(tmp_path / "disk", "600k")  # for the gradebook, and not for the rest
+    line = refused(submitted, disk / "grades")
+    assert "space" in line or "full" in line
+    verdicts(disk / "grades")
+    enlarge(disk)
+    grade(submitted, disk / "grades")
+    assert results(disk / "grades") == results(undisturbed[0])
+    assert not leftovers(disk / "grades")
+
+
+def test_without_room_for_verdicts_those_that_are_written_are_kept(submitted, undisturbed, small_disk, tmp_path):
+    disk = small_disk(tmp_path / "grades" / "verdicts", "8k")
+    assert "No space left on device" in refused(submitted, tmp_path / "grades")
+    kept = verdicts(tmp_path / "grades")
+    assert 0 < len(kept) < 3 and kept.items() <= verdicts(undisturbed[0]).items()
+    enlarge(disk)
+    grade(submitted, tmp_path / "grades")
+    assert results(tmp_path / "grades") == results(undisturbed[0])
+    assert not leftovers(tmp_path / "grades")
+
+
+@pytest.mark.parametrize("size", ["64k", "300k"])
+def test_without_room_for_the_gradebook_earlier_verdicts_are_kept(submitted, undisturbed, small_disk, tmp_path, size):
+    out, disk = tmp_path / "grades", small_disk(tmp_path / "disk", size)
+    shutil.copytree(undisturbed[0], out)
+    line = refused(submitted, out, "--db-url", f"sqlite:///{disk}/gradebook.db")
+    assert "full" in line or "disk I/O error" in line
+    assert verdicts(out) == verdicts(undisturbed[0])
+    enlarge(disk)
+    grade(submitted, out, "--db-url", f"sqlite:///{disk}/gradebook.db")
+    assert results(out) == results(undisturbed[0])
 
 
 def test_absent_students_and_scores_by_hand_are_kept(submitted, undisturbed, tmp_path):
@@ -139,9 +105,9 @@ def test_absent_students_and_scores_by_hand_are_kept(submitted, undisturbed, tmp
         book.db.commit()
     shutil.copytree(submitted / "ann", tmp_path / "later" / "ann")
     grade(tmp_path / "later", out)
-    verdicts, grades, questions, _ = results(out)
-    assert {name: verdicts[name] for name in ("bob", "eve")} == {name: before[0][name] for name in ("bob", "eve")}
-    assert verdicts["ann"]["manual_score"] == 2.5 and verdicts["ann"]["score"] == 10
+    found, grades, questions, _ = results(out)
+    assert {name: found[name] for name in ("bob", "eve")} == {name: before[0][name] for name in ("bob", "eve")}
+    assert found["ann"]["manual_score"] == 2.5 and found["ann"]["score"] == 10
     assert [row for row in grades.splitlines() if ",ann," not in row] == [
         row for row in before[1].splitlines() if ",ann," not in row
     ]

@@ -376,7 +376,7 @@ def test_a_verdict_that_is_not_recorded_is_not_shown(tmp_path):
 def test_the_course_folder_never_holds_a_password(tmp_path):
     write_course(tmp_path, {}, "postgresql://course:secret@db.example/grades")
     text = (tmp_path / "nbgrader_config.py").read_text()
-    assert "postgresql://course@db.example/grades" in text
+    assert "postgresql+psycopg://course@db.example/grades" in text
     assert "secret" not in text
 
 
