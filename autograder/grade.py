@@ -96,11 +96,12 @@ def grade(
 
 def _try_database(db_url: str | None) -> None:
     """One that a teacher has named may refuse, which is better told before anything is judged."""
+    if not db_url:
+        return
     from autograder.reporting import database
 
     try:
-        if db_url:
-            database.try_it(db_url)
+        database.try_it(db_url)
     except database.UnusableURL as error:
         raise GradingError(str(error)) from None
 

@@ -1123,7 +1123,7 @@ GRPO_ITERATION = Exercise(
     reference=ch101.grpo_iteration,
     criteria={"values": 3.0},
     cases=(
-        _case("what it learns in thirty iterations", _practice(learning_rate=4.0), repeat=30, **_LEARNS, visible=True, draws=2),
+        _case("what it learns in ten iterations", _practice(32, learning_rate=20.0), repeat=10, **_LEARNS, visible=True, draws=2),
         _case("the policy after one iteration", _practice(16), **_TABLE, visible=True, draws=2),
         _case("one divisor for all tokens", _practice(16, how="constant"), **_TABLE, visible=True),
         _case(
