@@ -3,7 +3,7 @@
 # make release write the students' bundle into release/   make check  style, types and the quick tests
 # make fuzz    ten minutes of made-up notebooks and workers' answers, led by the code that they reach (installs atheris; MINUTES=60 for longer)
 # make semester  a class of STUDENTS=300 hands in ten chapters, and its teacher does what teachers do: hours, stopped and gone on with at will
-# make bench   how fast are the grader, beside stock nbgrader, PPO and SAC, beside Stable-Baselines3, and DPO, beside TRL (installs both)
+# make bench   how fast are the grader, beside stock nbgrader, PPO and SAC, beside Stable-Baselines3, DPO and GRPO, beside TRL (installs both)
 # The environment is .venv; it is brought up to date whenever the pins or pyproject.toml change.
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v python3.13 || command -v python3)
@@ -54,6 +54,7 @@ bench: install
 	$(BIN)/python tools/bench_ppo.py
 	$(BIN)/python tools/bench_sac.py
 	$(BIN)/python tools/bench_dpo.py
+	$(BIN)/python tools/bench_grpo.py
 
 fuzz: install
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[fuzz]'
