@@ -1136,7 +1136,7 @@ GRPO_ITERATION = Exercise(
         # whichever deviation divides, a gradient that is cut to one length keeps only its direction
         _case(
             "scaled by the group, a short gradient",
-            _practice(16, scale="group", max_grad_norm=0.003),
+            _practice(64, scale="group", epochs=1, max_grad_norm=0.003, learning_rate=200.0),
             **_TABLE,
             visible=True,
             draws=3,
