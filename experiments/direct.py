@@ -144,9 +144,9 @@ def own_texts(count: int, candidates: int, seed: int, writer: lm.LanguageModel |
             [prompt for prompt in prompts for _ in range(candidates)], rlhf.PPO.new_tokens, generator=generator
         )
         scores = proxy(samples).unflatten(0, (-1, candidates))
-        first = torch.arange(len(prompts)) * candidates
+        rows = torch.arange(len(prompts)) * candidates
         written = completion_mask(samples.input_ids, samples.prompt_lengths, model.end_id)
-        for row in torch.stack([first + scores.argmax(1), first + scores.argmin(1)], 1).flatten().tolist():
+        for row in torch.stack([rows + scores.argmax(1), rows + scores.argmin(1)], 1).flatten().tolist():
             kept = samples.attention_mask[row]
             picked.append([part[row][kept] for part in (samples.input_ids, samples.attention_mask, written)])
     padding = (model.end_id, False, False)
