@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -592,6 +594,7 @@ def main() -> None:
         from course_lib.checks.terminal import print_anything
 
         print_anything()
+    atexit.register(gc.freeze)  # or Python ends with a search for cycles in all that torch has loaded, nearly a second
     app()
 
 
