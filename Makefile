@@ -1,4 +1,4 @@
-# make book    build book/_build/html/index.html          make test   all tests (installs browsers, bubblewrap and PostgreSQL if it may)
+# make book    build book/_build/html/index.html          make test   all tests (installs browsers, sandboxes and PostgreSQL if it may)
 # make test ONLY=ch44    one chapter all the way, in about a minute
 # make release write the students' bundle into release/   make check  style, types and the quick tests
 # make fuzz    ten minutes of made-up notebooks and workers' answers, led by the code that they reach (installs atheris; MINUTES=60 for longer)

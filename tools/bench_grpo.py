@@ -24,6 +24,7 @@ from pathlib import Path
 
 import torch
 import transformers
+from bench_dpo import Stopwatch
 from datasets import Dataset, disable_progress_bars
 from rich.console import Console
 from rich.table import Table
@@ -46,16 +47,6 @@ def started() -> lm.LanguageModel:
     for _ in verifiable.warm_up(policy, steps=100, seed=0):
         pass
     return policy
-
-
-class Stopwatch(transformers.TrainerCallback):
-    """Remembers the processor time after each step of the optimiser."""
-
-    def on_train_begin(self, *_, **__):
-        self.ends = []
-
-    def on_step_end(self, *_, **__):
-        self.ends.append(time.process_time())
 
 
 def reward(prompts, completions, **_) -> list[float]:

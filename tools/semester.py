@@ -234,11 +234,6 @@ def attacks(seed: int, count: int) -> list[str]:
     return found
 
 
-def parted(students: list[str], size: int) -> list[list[str]]:
-    """The sections of a class."""
-    return [students[start : start + size] for start in range(0, len(students), size)]
-
-
 def rests_on() -> str:
     """A hash of what answers, scores and attacks are drawn from."""
     paths = [
