@@ -103,11 +103,14 @@ def _panels(first: dict[str, Series], abscissae: list, values: list) -> list[dic
         low, high = min(0, *heights), max(0, *heights)
         margin = 0.05 * (high - low or 1)
         positions = [x for i in indices for x in abscissae[i]]
+        left, right = min(positions), max(positions)
+        bars = any(one.kind == "bar" for one in first.values() if one.panel == label)
+        beside = 0.5 if bars else 0.02 * (right - left or 1)
         panels.append(
             {
                 "label": label,
                 "series": indices,
-                "x": [min(positions) - 0.5, max(positions) + 0.5],
+                "x": [left - beside, right + beside],
                 "y": [low - margin if low < 0 else 0, high + margin],
             }
         )
