@@ -212,7 +212,7 @@ def _execute(chapter: Chapter) -> NotebookNode:
     freeze.write(exercises, COURSE_LIB / "frozen")
     cells = _code_cells(chapter)
     notebook = new_notebook(cells=[new_code_cell(_source(chapter, cell), metadata={"tags": sorted(cell.tags)}) for cell in cells])
-    print(f"{chapter.assignment}: running {len(cells)} code cells", flush=True)
+    _say(f"{chapter.assignment}: running {len(cells)} code cells")
     started = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="course-book-") as folder:
         artefacts.hand_in(exercises, Path(folder))
@@ -231,8 +231,13 @@ def _execute(chapter: Chapter) -> NotebookNode:
             run_sync(kernels.shutdown_kernel)(now=True)  # nbclient leaves a manager that it was given running
     notebook.metadata["cpu_seconds"] = round(spent[-1], 1)
     each = [after - before for before, after in itertools.pairwise(spent)]
-    print(f"{chapter.assignment}: ran in {time.monotonic() - started:.0f} s, {_cost(chapter, each)}", flush=True)
+    _say(f"{chapter.assignment}: ran in {time.monotonic() - started:.0f} s, {_cost(chapter, each)}")
     return notebook
+
+
+def _say(line: str) -> None:
+    """A line and its end in one write: chapters that run side by side share the output, and `print` may write the end apart."""
+    print(f"{line}\n", end="", flush=True)
 
 
 def _processor_seconds(process: psutil.Process) -> float:
