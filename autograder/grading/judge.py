@@ -31,7 +31,7 @@ from autograder.grading.verdicts import Item, Verdict, clean_text
 from autograder.paths import COURSE_LIB, ROOT
 from course_lib.checks.artefact import FrozenArtefact
 from course_lib.checks.cases import FrozenExercise, Observation
-from course_lib.checks.diagnosis import Finding, diagnose, view
+from course_lib.checks.diagnosis import Finding, begin_with, diagnose, view
 from course_lib.checks.names import WORD
 from course_lib.checks.notebook import NAMED, Stop, is_check, is_live
 from course_lib.checks.notebook import needed as needed_stops
@@ -300,9 +300,10 @@ class _Run:
                 self._wait_until_ready(sandbox)
                 if self._left() > 0 and self._load(sandbox, attempt):
                     self._ask_all(sandbox, attempt)
+        found = {name: self._found.get(name) or self._never_asked(exercise) for name, exercise in self._exercises.items()}
         return {
-            name: self._with_causes(self._found.get(name) or self._never_asked(exercise))
-            for name, exercise in self._exercises.items()
+            name: begin_with(self._with_causes(finding), [found[other] for other in found if other in self._uses.get(name, ())])
+            for name, finding in found.items()
         }
 
     @contextmanager

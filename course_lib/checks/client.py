@@ -15,7 +15,8 @@ from pathlib import Path
 
 from course_lib.checks.cases import FrozenExercise
 from course_lib.checks.cells import notes
-from course_lib.checks.names import roughly_set_by
+from course_lib.checks.diagnosis import Finding, begin_with, examine
+from course_lib.checks.names import roughly_set_by, used_by
 from course_lib.checks.notebook import NAMED
 from course_lib.checks.results import CheckResult, examined
 from course_lib.checks.stored import load
@@ -46,7 +47,17 @@ def _check_function(name: str, function: Callable) -> CheckResult:
     result = examined(visible_cases(name), function)
     if result.finding.state == "error":
         result.finding.message = "; ".join([result.finding.message, *_cells_to_run(result.finding.message)])
+    if not result.passed:
+        result.finding = begin_with(result.finding, _called(name, function))
     return result
+
+
+def _called(name: str, function: Callable) -> list[Finding]:
+    """What the checks say of the other exercises that a function calls, itself or through others of the notebook."""
+    namespace = getattr(function, "__globals__", {})
+    known = {other for other in exercise_names() if other != name and not is_judged_by_file(other)}
+    called = {other: namespace.get(other) for other in used_by(function, namespace) if other in known}
+    return [examine(visible_cases(other), one) for other, one in called.items() if callable(one)]
 
 
 def _cells_to_run(message: str) -> list[str]:

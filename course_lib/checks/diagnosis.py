@@ -7,7 +7,7 @@ of data: nothing of the learner's is executed here.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -38,6 +38,20 @@ class Finding:
 def examine(exercise: FrozenExercise, function: Callable) -> Finding:
     """Judge a function in this process: a learner's own notebook, or code that is trusted."""
     return diagnose(exercise, [view(case, observe(function, **case.call)) for case in exercise.cases])
+
+
+def begin_with(finding: Finding, others: Iterable[Finding]) -> Finding:
+    """The finding, whose message first names those of the `others` that its answer calls and that do not pass either.
+
+    >>> ratio = Finding("importance_ratio", "wrong", 0.0, 1.0)
+    >>> begin_with(Finding("clip_fraction", "wrong", 0.0, 1.0, message="1 where 0 is right."), [ratio]).message
+    'It calls importance_ratio, which does not pass its own check: begin there.\\n1 where 0 is right.'
+    """
+    names = [one.exercise for one in others if one.state != "correct" and one.exercise != finding.exercise]
+    if finding.state == "correct" or not names:
+        return finding
+    rest = "which does not pass its own check: begin there" if len(names) == 1 else "which do not pass their own checks: begin there"
+    return replace(finding, message=f"It calls {' and '.join(names)}, {rest}.\n{finding.message}")
 
 
 def view(case: FrozenCase, seen: Observation) -> Observation:

@@ -26,6 +26,8 @@ def place(name):
 
 
 SUMS = place("lambda_returns")
+BEGIN = "^It calls %s: begin there\\.\n"
+BOTH = BEGIN % "td_residuals and compute_gae, which do not pass their own checks"
 
 
 def case(score=10.0, flags=(), says=None, status="graded"):
@@ -407,6 +409,18 @@ def pools_of_processes(nb):
 
 
 # ---------------------------------------------------------------- what every notebook can
+
+
+@case(3.0, says={"compute_gae": BEGIN % "td_residuals, which does not pass its own check", "repaired_targets": BOTH})
+def what_fails_by_another_exercise_says_where_to_begin(nb):
+    nb.change("td_residuals", "gamma * next_values", "next_values")
+
+
+@case(
+    7.0, says={"lambda_returns": "^(?!It calls)", "repaired_targets": BEGIN % "lambda_returns, which does not pass its own check"}
+)
+def what_calls_right_ones_does_not(nb):
+    nb.sum_is("(advantages - values)")
 
 
 @case()

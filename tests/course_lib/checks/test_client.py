@@ -1,5 +1,6 @@
 """The learner's check: what it says, how fast, and how it fails on bad input."""
 
+import inspect
 import json
 import os
 import subprocess
@@ -65,6 +66,28 @@ def test_a_learners_exception_comes_without_our_traceback():
         return undefined_name  # noqa: F821
 
     assert "NameError: name 'undefined_name' is not defined" in repr(check(compute_gae))
+
+
+@pytest.mark.parametrize(
+    ("earlier", "headline"),
+    [("rewards - values", "Not yet"), ("unheard_of", "It stops with an error"), ("not_yet()", "Not implemented yet")],
+)
+def test_what_fails_by_another_exercise_says_where_to_begin(earlier, headline):
+    def not_yet():
+        raise NotImplementedError
+
+    notebook = dict(vars(solutions), not_yet=not_yet)
+    exec(inspect.getsource(solutions.compute_gae), notebook)
+    exec(f"def td_residuals(rewards, values, next_values, terminated, gamma=0.99):\n    return {earlier}", notebook)
+    result = check(notebook["compute_gae"])
+    assert result.headline() == f"{headline}: compute_gae"
+    assert result.lines()[0] == "It calls td_residuals, which does not pass its own check: begin there."
+
+
+def test_what_calls_a_right_one_has_its_own_fault():
+    notebook = {"td_residuals": solutions.td_residuals}
+    exec("def compute_gae(*given):\n    return -td_residuals(*given[:4])", notebook)
+    assert "td_residuals" not in repr(check(notebook["compute_gae"]))
 
 
 def test_html_escapes_what_a_learner_raises():
