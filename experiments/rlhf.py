@@ -30,7 +30,7 @@ CANDIDATES, BEST_OF_N_PROMPTS = 64, 64
 VARIANTS: dict[str, dict[str, Any]] = {
     "sft": {"steps": 40},
     "best_of_n": {"candidates": CANDIDATES, "also_by": ["mean", "min", "twice"]},
-    "distilled": {"candidates": 16, "prompts": 640, "steps": 40, "batch": 16, "learning_rate": 2e-4},
+    "distilled": {"candidates": 8, "prompts": 640, "steps": 40, "batch": 16, "learning_rate": 2e-4},
     **{f"flipped_{rate}": {"flipped": rate} for rate in (0.0, 0.1, 0.2, 0.3, 0.4)},
     **{f"comparisons_{count}": {"comparisons": count} for count in (250, 1000, 16_000)},
     "frozen_body": {"features": "tiny, last layer, last token"},
