@@ -37,12 +37,12 @@ VARIANTS: dict[str, dict] = {
     "pendulum_rounds": {"task": "pendulum", "comparisons": 300, "noise": NOISE["unsure"], "rounds": 5},
     "cartpole_rounds": {"task": "cartpole", "comparisons": 300, "noise": NOISE["sure"], "rounds": 5},
     **{
-        f"{task}_queries_{rule}": {"task": task, "queries": rule, "comparisons": 300, "noise": NOISE["unsure"]} | ENSEMBLE
-        for task, rules in (("pendulum", ("random", "uncertain", "disagreement")), ("cartpole", ("random", "disagreement")))
-        for rule in rules
+        f"pendulum_queries_{rule}{person}": {"task": "pendulum", "queries": rule, "comparisons": 300, "noise": noise} | ENSEMBLE
+        for rule in ("random", "disagreement")
+        for person, noise in (("", NOISE["unsure"]), ("_sure", NOISE["sure"]))
     },
 }
-SEEDS = {variant: 10 if "queries" in choice else 5 for variant, choice in VARIANTS.items()}
+SEEDS = 5
 
 SETTINGS = {
     "cartpole": PPOSettings(
@@ -153,15 +153,8 @@ class Ensemble(torch.nn.Module):
         return torch.stack([segment_returns(member(segments.obs, segments.actions), segments.mask) for member in self.members])
 
 
-def wanted(rule, gaps, count):
-    """Which `count` of the candidate pairs to ask about, by the gaps (members, pairs) that the members give them."""
-    chances = torch.sigmoid(gaps)
-    worth = {"uncertain": -(chances.mean(0) - 0.5).abs(), "disagreement": chances.std(0)}
-    return worth[rule].topk(count).indices
-
-
 def asked_in_turn(choice, policy, seed, report):
-    """Ask for comparisons of one policy's clips, a few at a time, each time about the pairs that the rule wants then.
+    """Ask for comparisons of one policy's clips, a few at a time: about random pairs, or those that the members disagree on most.
 
     Returns: the clips, the ensemble after the last answer, and a row for each time: answers so far, and how well they teach.
     """
@@ -174,9 +167,9 @@ def asked_in_turn(choice, policy, seed, report):
     for time in range(choice["times"]):
         first, second = clips.draw_pairs(len(pool), choice["candidates"], generator)
         picked = torch.arange(count)
-        if ensemble and choice["queries"] != "random":
-            returns = ensemble.returns(pool)
-            picked = wanted(choice["queries"], returns[:, first] - returns[:, second], count)
+        if ensemble and choice["queries"] == "disagreement":
+            returns = ensemble.returns(pool)  # (members, clips)
+            picked = torch.sigmoid(returns[:, first] - returns[:, second]).std(0).topk(count).indices
         asked.append(answered(pool, first[picked], second[picked], choice["noise"], generator))
         chosen, rejected = (joined(parts) for parts in list(zip(*asked, strict=True))[:2])
         members = []
