@@ -21,6 +21,7 @@ NOISE = {
     "guessing": 2.0,
 }  # the person's temperature, in standard deviations of the clips' true returns
 KL_COEFS = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0)
+ENSEMBLE = {"members": 3, "times": 10, "candidates": 1000}  # asked ten times, for a tenth of the comparisons among so many pairs
 
 VARIANTS: dict[str, dict] = {
     **{f"cruise_{kl_coef:g}": {"task": "cruise", "comparisons": 100, "noise": 0.5, "kl_coef": kl_coef} for kl_coef in KL_COEFS},
@@ -35,6 +36,11 @@ VARIANTS: dict[str, dict] = {
     },
     "pendulum_rounds": {"task": "pendulum", "comparisons": 300, "noise": NOISE["unsure"], "rounds": 5},
     "cartpole_rounds": {"task": "cartpole", "comparisons": 300, "noise": NOISE["sure"], "rounds": 5},
+    **{
+        f"pendulum_queries_{rule}{person}": {"task": "pendulum", "queries": rule, "comparisons": 300, "noise": noise} | ENSEMBLE
+        for rule in ("random", "disagreement")
+        for person, noise in (("", NOISE["unsure"]), ("_sure", NOISE["sure"]))
+    },
 }
 SEEDS = 5
 
@@ -117,6 +123,11 @@ def ask(pool, comparisons, noise, seed):
     """Show a simulated person pairs of clips. Returns: (chosen, rejected, share of answers against the better clip)."""
     generator = torch.Generator().manual_seed(seed)
     first, second = clips.draw_pairs(len(pool), comparisons, generator)
+    return answered(pool, first, second, noise, generator)
+
+
+def answered(pool, first, second, noise, generator):
+    """As `ask`, about these pairs."""
     returns = segment_returns(pool.rewards, pool.mask).double()
     temperature = max(noise * returns.std().item(), 1e-3)  # clips may all be alike
     answers = simulate_preferences(returns[first], returns[second], temperature, generator)
@@ -124,6 +135,52 @@ def ask(pool, comparisons, noise, seed):
     mistakes = differ & (answers != (returns[first] > returns[second]))
     chosen, rejected = torch.where(answers, first, second), torch.where(answers, second, first)
     return pool[chosen], pool[rejected], mistakes.sum().item() / max(differ.sum().item(), 1)
+
+
+class Ensemble(torch.nn.Module):
+    """Reward models of different seeds, fitted to the same answers; what they give together is the mean."""
+
+    def __init__(self, members):
+        super().__init__()
+        self.members = torch.nn.ModuleList(members)
+
+    def forward(self, obs, actions):
+        """Rewards (...,) of obs (..., O) and actions (..., A)."""
+        return torch.stack([member(obs, actions) for member in self.members]).mean(0)
+
+    def returns(self, segments):
+        """Of each clip from each member, (members, B)."""
+        return torch.stack([segment_returns(member(segments.obs, segments.actions), segments.mask) for member in self.members])
+
+
+def asked_in_turn(choice, policy, seed, report):
+    """Ask for comparisons of one policy's clips, a few at a time: about random pairs, or those that the members disagree on most.
+
+    Returns: the clips, the ensemble after the last answer, and a row for each time: answers so far, and how well they teach.
+    """
+    task, count = choice["task"], choice["comparisons"] // choice["times"]
+    generator = torch.Generator().manual_seed(seed)
+    pool, held_out = collect_clips(task, policy, POOL, seed), collect_clips(task, policy, HELD_OUT, 1000 + seed)
+    asked: list = []
+    rows: list[dict] = []
+    ensemble = None
+    for time in range(choice["times"]):
+        first, second = clips.draw_pairs(len(pool), choice["candidates"], generator)
+        picked = torch.arange(count)
+        if ensemble and choice["queries"] == "disagreement":
+            returns = ensemble.returns(pool)  # (members, clips)
+            picked = torch.sigmoid(returns[:, first] - returns[:, second]).std(0).topk(count).indices
+        asked.append(answered(pool, first[picked], second[picked], choice["noise"], generator))
+        chosen, rejected = (joined(parts) for parts in list(zip(*asked, strict=True))[:2])
+        members = []
+        for own_seed in (seed + 1000 * member for member in range(choice["members"])):
+            members.append(clips.RewardModel(pool.obs.shape[-1], pool.actions.shape[-1], seed=own_seed).scale_to(pool))
+            clips.fit(members[-1], chosen, rejected, preference_loss, seed=own_seed)
+        ensemble = Ensemble(members).requires_grad_(False)
+        mistakes = sum(entry[2] for entry in asked) / len(asked)
+        rows.append({"comparisons": len(chosen), "mistakes": mistakes} | quality(ensemble, held_out))
+        report(time + 1, choice["times"])
+    return pool, ensemble, rows
 
 
 def preference_loss(model, chosen, rejected):
@@ -224,6 +281,13 @@ def run(variant, seed, checkpoint_dir, report):
         train(0, None)
         judge(None)
         return Result(rows, summary)
+
+    if "queries" in choice:
+        pool, ensemble, answers = asked_in_turn(choice, policy, seed, report)
+        learned = frozen_reward(task, ensemble, pool)
+        train(0, learned)
+        judge(learned)
+        return Result(answers, answers[-1] | summary)
 
     asked: list = []
     for round_number in range(rounds):

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch.nn.utils.rnn import pad_sequence
 
 from course_lib.language import lm, preferences
 from course_lib.language.fine_tuning import Taught, TokenPPO, Writer, openings, train
@@ -28,7 +29,8 @@ EVALUATION_TEXTS = 256
 CANDIDATES, BEST_OF_N_PROMPTS = 64, 64
 VARIANTS: dict[str, dict[str, Any]] = {
     "sft": {"steps": 40},
-    "best_of_n": {"candidates": CANDIDATES},
+    "best_of_n": {"candidates": CANDIDATES, "also_by": ["mean", "min", "twice"]},
+    "distilled": {"candidates": 8, "prompts": 640, "steps": 40, "batch": 16, "learning_rate": 2e-4},
     **{f"flipped_{rate}": {"flipped": rate} for rate in (0.0, 0.1, 0.2, 0.3, 0.4)},
     **{f"comparisons_{count}": {"comparisons": count} for count in (250, 1000, 16_000)},
     "frozen_body": {"features": "tiny, last layer, last token"},
@@ -44,7 +46,8 @@ OTHER = 100  # added to a seed for the second reward model: other comparisons, o
 def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result:
     """One part of the pipeline; those before it are made, or taken from this process's earlier runs."""
     kind = variant.partition("_")[0]
-    return {"sft": _sft, "ppo": _ppo, "best": _best_of_n, "frozen": _frozen_body}.get(kind, _labels)(variant, seed, report)
+    kinds = {"sft": _sft, "ppo": _ppo, "best": _best_of_n, "distilled": _distilled, "frozen": _frozen_body}
+    return kinds.get(kind, _labels)(variant, seed, report)
 
 
 @functools.cache
@@ -132,16 +135,20 @@ def _ppo(variant: str, seed: int, report: Report) -> Result:
 
 
 def _best_of_n(variant: str, seed: int, report: Report) -> Result:
+    """Chosen by the proxy, and by the mean and by the smaller of two models' scores, and by one model with the comparisons of both."""
     policy, (proxy, other) = fine_tuned(seed)[0], proxies(seed)
+    twice = Proxy(_fitted(preferences.comparisons(2 * COMPARISONS, seed), seed), ch96.last_token_scores)
     prompts = openings("test")[:BEST_OF_N_PROMPTS]
     generator = torch.Generator().manual_seed(20_000 + seed)
     begun = time.perf_counter()
-    tables: dict[str, list[torch.Tensor]] = {"proxy": [], "other": [], "gold": []}
+    tables: dict[str, list[torch.Tensor]] = {"proxy": [], "other": [], "gold": [], "tokens": [], "twice": []}
     repeated = [prompt for prompt in prompts for _ in range(4)]
     for call in range(CANDIDATES // 4):
         samples = policy.generate(repeated, PPO.new_tokens, generator=generator)
+        written = ch95.completion_mask(samples.input_ids, samples.prompt_lengths, policy.end_id)
         for name, scores in (
-            ("proxy", proxy(samples)), ("other", other(samples)), ("gold", gold_judge()(whole_texts(policy, samples)))
+            ("proxy", proxy(samples)), ("other", other(samples)), ("gold", gold_judge()(whole_texts(policy, samples))),
+            ("tokens", written.sum(1).float()), ("twice", twice(samples)),
         ):  # fmt: skip
             tables[name].append(scores.view(len(prompts), 4))
         report(call + 1, CANDIDATES // 4)
@@ -150,10 +157,48 @@ def _best_of_n(variant: str, seed: int, report: Report) -> Result:
     rows = []
     for n in (1, 2, 4, 8, 16, 32, 64):
         groups = {name: scores.unflatten(1, (-1, n)).flatten(0, 1) for name, scores in everything.items()}
-        best = ch96.best_of_n(groups["proxy"])[:, None]
-        means = {name: scores.gather(1, best).mean().item() for name, scores in groups.items()}
-        rows.append({"n": n, "kl": ch96.best_of_n_kl(n), **means, "seconds": seconds * n / CANDIDATES})
+        both = torch.stack([groups["proxy"], groups["other"]])
+        by = {"proxy": groups["proxy"], "mean": both.mean(0), "min": both.amin(0), "twice": groups.pop("twice")}
+        best = {rule: ch96.best_of_n(scores)[:, None] for rule, scores in by.items()}
+        means = {name: scores.gather(1, best["proxy"]).mean().item() for name, scores in groups.items()}
+        also = {f"gold_by_{rule}": groups["gold"].gather(1, best[rule]).mean().item() for rule in VARIANTS[variant]["also_by"]}
+        rows.append({"n": n, "kl": ch96.best_of_n_kl(n), **means, **also, "seconds": seconds * n / CANDIDATES})
     return Result(rows, {"proxy_and_gold": _correlation(everything["proxy"].flatten(), everything["gold"].flatten())})
+
+
+def _distilled(variant: str, seed: int, report: Report) -> Result:
+    """Best of n as training texts: the policy is fine-tuned on the best of its candidates for each prompt, and writes one text after."""
+    choice, reference, (proxy, _) = VARIANTS[variant], fine_tuned(seed)[0], proxies(seed)
+    generator = torch.Generator().manual_seed(50_000 + seed)
+    begun = time.process_time()
+    kept: list[tuple[torch.Tensor, ...]] = []  # of each best text: tokens, that none is padding, which were written
+    prompts, many = openings("policy")[: choice["prompts"]], choice["candidates"]
+    for first in range(0, len(prompts), 8):
+        repeated = [prompt for prompt in prompts[first : first + 8] for _ in range(many)]
+        samples = reference.generate(repeated, PPO.new_tokens, generator=generator)
+        written = ch95.completion_mask(samples.input_ids, samples.prompt_lengths, reference.end_id)
+        for row in (torch.arange(0, len(repeated), many) + ch96.best_of_n(proxy(samples).view(-1, many))).tolist():
+            own = samples.attention_mask[row]
+            kept.append(tuple(part[row][own] for part in (samples.input_ids, samples.attention_mask, written)))
+        report(len(kept), len(prompts))
+    input_ids, attention_mask, written = (
+        pad_sequence(list(part), batch_first=True, padding_value=value)
+        for part, value in zip(zip(*kept, strict=True), (reference.end_id, False, False), strict=True)
+    )
+    policy = reference.frozen_copy().requires_grad_(True)
+    optimizer = torch.optim.AdamW(policy.parameters(), lr=choice["learning_rate"], weight_decay=0.0)
+    rows = []
+    for step, picks in enumerate(torch.randperm(len(kept), generator=generator).split(choice["batch"])[: choice["steps"]]):
+        logps = ch95.per_token_logps(policy.logits(input_ids[picks], attention_mask[picks]), input_ids[picks])
+        loss = -ch95.masked_mean(logps, written[picks, 1:])
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+        optimizer.step()
+        rows.append({"step": step, "loss": loss.item()})
+    seconds = time.process_time() - begun
+    summary, texts = evaluation(policy, seed)
+    return Result(rows, summary | {"cpu_seconds": seconds, "texts": texts[:8]})
 
 
 def _labels(variant: str, seed: int, report: Report) -> Result:
