@@ -29,9 +29,10 @@ PAGE: dict[str, Any] = {
     "num_steps": 32,
     "gamma": 0.99,
     "gae_lambda": 0.95,
+    "learning_rate": 1e-2,
     "weights": "normalised",  # or as they are, centred only, divided by their deviation only
     "position_unit": 1.0,
-    "normalised_obs": False,
+    "normalised_obs": False,  # or with statistics of the observations so far, or of the first so many
     "reward_unit": 1.0,
     "scaled_rewards": False,
     "value_clip": None,
@@ -43,6 +44,9 @@ CHANGES: dict[str, dict[str, Any]] = {
     "advantages_centred": {"weights": "centred"},
     "advantages_divided": {"weights": "divided"},
     "normalised_obs": {"normalised_obs": True},
+    "normalised_obs_fixed": {"normalised_obs": 1024},
+    "learning_rate_0.003": {"learning_rate": 3e-3},
+    "normalised_obs_learning_rate_0.003": {"normalised_obs": True, "learning_rate": 3e-3},
     "bad_units": {"position_unit": 100.0},
     "bad_units_normalised_obs": {"position_unit": 100.0, "normalised_obs": True},
     "scaled_rewards": {"scaled_rewards": True},
@@ -94,7 +98,8 @@ class Seen(gym.vector.VectorWrapper):
       envs: CartPole's, with same-step autoreset.
       gamma: discount of the returns by whose deviation rewards are divided.
       position_unit, reward_unit: factors of the two positions, and of all rewards.
-      normalised_obs, scaled_rewards: whether running statistics are applied to either.
+      normalised_obs: whether statistics of all observations so far are applied to them, or only of so many, if it is a number.
+      scaled_rewards: whether rewards are divided by the deviation of the discounted returns so far.
     """
 
     def __init__(self, envs, gamma, position_unit=1.0, reward_unit=1.0, normalised_obs=False, scaled_rewards=False):
@@ -102,6 +107,7 @@ class Seen(gym.vector.VectorWrapper):
         self.units = np.array([position_unit, 1.0, position_unit, 1.0], dtype=np.float32)
         self.gamma, self.reward_unit = gamma, reward_unit
         self.obs_seen = Running() if normalised_obs else None
+        self.learn_from = np.inf if normalised_obs is True else normalised_obs
         self.returns_seen = Running() if scaled_rewards else None
         self.returns = np.zeros(envs.num_envs)
 
@@ -112,18 +118,21 @@ class Seen(gym.vector.VectorWrapper):
             return obs
         return ((obs - self.obs_seen.mean) / self.obs_seen.deviation()).clip(-10, 10).astype(np.float32)
 
+    def learn(self, obs):
+        """Let observations count in the statistics, if they are still learned."""
+        if self.obs_seen is not None and self.obs_seen.count < self.learn_from:
+            self.obs_seen.add(obs * self.units)
+
     def reset(self, *, seed=None, options=None):
         """Start all episodes."""
         obs, info = self.env.reset(seed=seed, options=options)
-        if self.obs_seen is not None:
-            self.obs_seen.add(obs * self.units)
+        self.learn(obs)
         return self.shown(obs), info
 
     def step(self, actions):
         """A step; it counts in the statistics before they are applied to it."""
         obs, rewards, terminated, truncated, info = self.env.step(actions)
-        if self.obs_seen is not None:
-            self.obs_seen.add(obs * self.units)
+        self.learn(obs)
         if "final_obs" in info:
             last = [None if one is None else self.shown(one) for one in info["final_obs"]]
             info = info | {"final_obs": last}
@@ -150,7 +159,7 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> list[d
     envs = Seen(recorder, **{name: with_[name] for name in seen})
     obs, _ = envs.reset(seed=seed)
     actor, critic = mlp(4, 2), mlp(4, 1)
-    optimizer = torch.optim.Adam([*actor.parameters(), *critic.parameters()], lr=1e-2)
+    optimizer = torch.optim.Adam([*actor.parameters(), *critic.parameters()], lr=with_["learning_rate"])
     rows = []
 
     def estimates(rollout):
