@@ -53,8 +53,9 @@ def compute_gae(
       truncated: True where a time limit cut the episode: bootstrap, no recursion;
         (T, N) bool.
       gamma: discount per step, in [0, 1].
-      gae_lambda: λ in [0, 1]; 0 gives the one-step residual, 1 the Monte Carlo return
-        minus the value.
+      gae_lambda: λ in [0, 1]; 0 gives the one-step residual, 1 the longest estimate that
+        the rollout allows, which is the Monte Carlo return minus the value where the
+        episode terminates in it.
 
     Returns: (T, N) advantages in units of reward, without a graph.
     Raises: ValueError that names an argument if shapes differ, or gamma or gae_lambda lies
@@ -83,7 +84,8 @@ def lambda_returns(advantages, values):
 
         R_t = A_t + V(s_t)
 
-    They are the Monte Carlo returns only at λ = 1. Sutton and Barto (2018), eq. 12.3.
+    They are Monte Carlo returns only at λ = 1, and where the episode terminates within
+    the rollout. Sutton and Barto (2018), eq. 12.3.
 
     Args:
       advantages: generalised advantage estimates in units of reward, not normalised;
@@ -126,7 +128,8 @@ def explained_variance(values, returns):
       values: V(s), in units of reward; any shape.
       returns: the targets, in the same shape.
 
-    Returns: scalar (0-dim) tensor without a graph; NaN where Var(returns) = 0.
+    Returns: scalar (0-dim) tensor in the dtype of values, without a graph; NaN where
+      Var(returns) = 0.
     Raises: ValueError that names an argument if the shapes differ.
     """
     validate.same_shape(values=values, returns=returns)

@@ -5,6 +5,8 @@ import math
 import pytest
 import torch
 
+from autograder.authoring import chapter
+from solutions import ch44
 from solutions.ch44 import (
     compute_gae,
     explained_variance,
@@ -105,3 +107,66 @@ def test_errors_name_the_argument_and_the_value_received(changes, name):
     received = changes[name] if name != "values" else r"\(3, 2\)"
     with pytest.raises(ValueError, match=f"{name}.*{received}"):
         compute_gae(**arguments)
+
+
+@pytest.fixture(scope="module")
+def page():
+    cells = [cell.source for cell in chapter.load("ch44").cells if cell.kind == "code"]
+    page = dict(vars(ch44))
+    for sign in ("from gymnasium.vector import", "def my_loss(", "def examine("):
+        (source,) = [source for source in cells if sign in source]
+        exec(source.partition("print(")[0], page)
+    return page
+
+
+class TestTryingTheLoss:
+    """The cell of the page that says what is right about a reader's loss."""
+
+    ANSWER = """
+def my_loss(rollout, actor, critic, old_values, next_values, old_log_probs):
+    ends = rollout.terminated, rollout.truncated
+    advantages = compute_gae(rollout.rewards, old_values, next_values, *ends, 0.99, 0.95)
+    returns = lambda_returns(advantages, old_values)
+    weights = normalize_advantages(advantages)
+    policy = Categorical(logits=actor(rollout.obs))
+    ratio = (policy.log_prob(rollout.actions) - old_log_probs).exp()
+    surrogate = torch.min(ratio * weights, ratio.clamp(0.8, 1.2) * weights).mean()
+    value_loss = (critic(rollout.obs).squeeze(-1) - returns).pow(2).mean()
+    return -surrogate + 0.5 * value_loss - 0.01 * policy.entropy().mean()
+"""
+
+    def said(self, page, *changes):
+        answer = self.ANSWER
+        for old, new in changes:
+            assert answer.count(old) == 1
+            answer = answer.replace(old, new)
+        given = dict(page)
+        exec(answer, given)
+        return page["examine"](given["my_loss"])
+
+    def test_the_page_begins_without_a_loss(self, page):
+        assert page["examine"](page["my_loss"]) == "my_loss gives nothing yet"
+
+    def test_the_right_loss_is_right_in_all(self, page):
+        said = self.said(page)
+        assert said.count(": right") == 2 and "perhaps" not in said
+
+    @pytest.mark.parametrize(
+        ("old", "new", "why"),
+        [
+            ("weights = normalize_advantages(advantages)", "weights = advantages", "weights are not normalised"),
+            ("lambda_returns(advantages", "lambda_returns(normalize_advantages(advantages)", "targets are made of normalised"),
+            ("ratio.clamp(0.8, 1.2)", "ratio", "ratio is not clipped"),
+            ("0.5 * value_loss", "value_loss", "the half"),
+            ("- 0.01", "+ 0.01", "entropy has the wrong sign"),
+        ],
+    )
+    def test_a_mistake_is_named(self, page, old, new, why):
+        assert why in self.said(page, (old, new))
+
+    def test_a_graph_on_the_targets_is_a_wrong_gradient_of_the_critic_alone(self, page):
+        graph = (
+            "returns = lambda_returns(advantages, old_values) + (critic(rollout.obs) - critic(rollout.obs).detach()).squeeze(-1)"
+        )
+        said = self.said(page, ("returns = lambda_returns(advantages, old_values)", graph))
+        assert "actor: right" in said and "critic: not right" in said and "perhaps" not in said
