@@ -36,7 +36,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     for variant, change in {
         "swing_up": {},
         **{f"plan_{pieces * PLANNER['hold']}": {"pieces": pieces} for pieces in (1, 2, 3, 10)},
-        "plan_40_held": {"hold": 8},
     }.items()
 }
 SEEDS = dict.fromkeys(VARIANTS, 6) | {"swing_up": 10}

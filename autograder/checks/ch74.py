@@ -1340,7 +1340,7 @@ _WRONG_DAGGER_ROUND = {
         "The labels lie halfway between the clone's action and the expert's: only the expert's are labels.",
     ),
     "graph-kept": (
-        {"asked": lambda expert, flown: expert(flown.obs) + 0 * flown.obs.requires_grad_().sum()},
+        {"asked": lambda expert, flown: expert(flown.obs)},
         "The answers carry the expert's graph: ask it under torch.no_grad().",
     ),
     "dtype-lost": (

@@ -42,9 +42,9 @@ def test_rows_are_horizons_and_the_summary_has_each_return(tiny, tmp_path, monke
 
 def test_variants_change_how_far_is_planned_and_nothing_else(tiny, tmp_path, monkeypatch):
     lengths = {name: given["pieces"] * given["hold"] for name, given in planning.VARIANTS.items()}
-    assert lengths == {"swing_up": 20, "plan_4": 4, "plan_8": 8, "plan_12": 12, "plan_40": 40, "plan_40_held": 40}
+    assert lengths == {"swing_up": 20, "plan_4": 4, "plan_8": 8, "plan_12": 12, "plan_40": 40}
     for given in planning.VARIANTS.values():
-        assert {**given, "pieces": 5, "hold": 4} == planning.VARIANTS["swing_up"]
+        assert given | {"pieces": 5} == planning.VARIANTS["swing_up"]
     asked = []
 
     def best_plan(model, obs, generator, **planner):
@@ -52,5 +52,5 @@ def test_variants_change_how_far_is_planned_and_nothing_else(tiny, tmp_path, mon
         return torch.zeros(planning.CARRIED_OUT, 1)
 
     monkeypatch.setattr(planning, "best_plan", best_plan)
-    planning.run("plan_40_held", 0, tmp_path, lambda done, total: None)
-    assert asked == [{"candidates": 100, "pieces": 5, "hold": 8}] * 300
+    planning.run("plan_40", 0, tmp_path, lambda done, total: None)
+    assert asked == [{"candidates": 100, "pieces": 10, "hold": 4}] * 300
