@@ -1,7 +1,7 @@
 """A small Dreamer on Pendulum: an actor that learns by gradients through a learned ensemble, along dreams of ten steps.
 
-The program of chapter 51's last experiment on Pendulum, evaluated as all agents of `control` are. "lam_0" trusts the critic after one
-step, so that gradient reaches an action through one step of the model alone. One update for each real step; rows are evaluations.
+The program of chapter 51's last experiment on Pendulum, evaluated as all agents of `control` are. "lam_0" asks the critic after each
+dreamt step, where "dreamer" waits longer. One update for each real step; rows are evaluations.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SEEDS = {"dreamer": 8, "lam_0": 4}
 
 
 def differentiable(model):
-    """The mean of the elite members as a world: gradient passes from what comes out to what goes in."""
+    """The elite members' mean as a world: gradient passes from outputs to inputs."""
 
     def step(obs, actions, generator):
         inputs = (torch.cat([obs, actions], -1) - model.input_level) / model.input_scale
@@ -58,7 +58,8 @@ class Dreamer:
         self.actor = Networks((3, 64, 64, 1), generator=generator)
         self.critic = Networks((3, 64, 64, 1), generator=generator)
         self.slow = self.critic.frozen_copy()
-        self.of_actor, self.of_critic = Adam(self.actor.weights, 1e-3), Adam(self.critic.weights, 3e-3)
+        self.of_actor = Adam(self.actor.weights, 1e-3)
+        self.of_critic = Adam(self.critic.weights, 3e-3)
 
     def act(self, obs, generator=None):
         return self.actor(obs)[0].tanh()
