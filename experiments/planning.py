@@ -9,6 +9,7 @@ predicting that nothing moves. The summary has the return of each episode.
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import gymnasium as gym
 import torch
 
 from course_lib.control import mbpo
-from course_lib.control.replay import ReplayBuffer
+from course_lib.control.replay import ReplayBuffer, Transitions
 from experiments.campaign import Report, Result
 from solutions.ch51 import gaussian_nll, imagine, model_error_by_horizon
 
@@ -28,11 +29,16 @@ EPISODES, STEPS, CARRIED_OUT = 4, 200, 2
 HORIZON, APART = 50, 10  # steps of a piece of the last episode, and between the starts of two
 
 VARIANTS: dict[str, dict[str, Any]] = {
-    "swing_up": {"environment": ENVIRONMENT, "episodes": EPISODES, "steps": STEPS, "carried_out": CARRIED_OUT}
+    variant: {"environment": ENVIRONMENT, "episodes": EPISODES, "steps": STEPS, "carried_out": CARRIED_OUT}
     | PLANNER
+    | change
     | {name: getattr(SETTINGS, name) for name in OF_THE_MODEL}
+    for variant, change in {
+        "swing_up": {},
+        **{f"plan_{pieces * PLANNER['hold']}": {"pieces": pieces} for pieces in (1, 2, 3, 10)},
+    }.items()
 }
-SEEDS = 10
+SEEDS = dict.fromkeys(VARIANTS, 6) | {"swing_up": 10}
 
 
 def best_plan(model, obs, generator, candidates, pieces, hold):
@@ -44,8 +50,8 @@ def best_plan(model, obs, generator, candidates, pieces, hold):
     return plans[:, dream["rewards"].sum(0).argmax()]
 
 
-def swing_up(seed: int, report: Report, episodes: int = EPISODES, steps: int = STEPS):
-    """Returns of each episode, the model after each but the last, and the last episode: obs (steps + 1, 3), actions (steps, 1)."""
+def swing_up(seed: int, report: Report, planner: Mapping[str, int] = PLANNER, episodes: int = EPISODES, steps: int = STEPS):
+    """Returns of each episode, the model after each but the last, and all steps."""
     env, generator = gym.make(ENVIRONMENT), torch.Generator().manual_seed(seed)
     model = mbpo.Ensemble(3, 1, SETTINGS, gaussian_nll, seed=seed)
     buffer, returns, models = ReplayBuffer(steps * episodes, 3, 1), [], []
@@ -54,7 +60,7 @@ def swing_up(seed: int, report: Report, episodes: int = EPISODES, steps: int = S
         returns.append(0.0)
         for step in range(steps):
             if episode and step % CARRIED_OUT == 0:
-                plan = best_plan(model, obs, generator, **PLANNER)
+                plan = best_plan(model, obs, generator, **planner)
             action = plan[step % CARRIED_OUT] if episode else 2 * torch.rand(1, generator=generator) - 1
             next_obs, reward, terminated, _, _ = env.step(2 * action.numpy())
             buffer.add(obs[None], action[None], [reward], next_obs[None], [terminated])
@@ -63,8 +69,12 @@ def swing_up(seed: int, report: Report, episodes: int = EPISODES, steps: int = S
             model.fit(buffer[torch.arange(len(buffer))], generator)
             models.append(copy.deepcopy(model))
         report(episode + 1, episodes)
-    last = buffer[torch.arange(len(buffer) - steps, len(buffer))]
-    return returns, models, torch.cat([last.obs, last.next_obs[-1:]]), last.actions
+    return returns, models, buffer[torch.arange(len(buffer))]
+
+
+def episode_of(everything: Transitions, steps: int = STEPS) -> tuple[torch.Tensor, torch.Tensor]:
+    """The last episode: obs (steps + 1, 3) and actions (steps, 1)."""
+    return torch.cat([everything.obs[-steps:], everything.next_obs[-1:]]), everything.actions[-steps:]
 
 
 def pieces_of(obs: torch.Tensor, actions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -83,14 +93,22 @@ def without_dice(model: mbpo.Ensemble):
     return expected
 
 
+def promised(model: mbpo.Ensemble) -> float:
+    """The reward that the members expect for standing still at the top, on average; in truth it is 0."""
+    mean, _ = model.distributions(torch.tensor([[1.0, 0.0, 0.0]]), torch.zeros(1, 1))
+    return mean[:, 0, -1].mean().item()
+
+
 def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result:
     """Swing up once, and measure the models; it takes seconds, so that no checkpoint is kept."""
-    returns, models, obs, actions = swing_up(seed, report)
-    real, taken = pieces_of(obs, actions)
+    planner = {name: VARIANTS[variant][name] for name in PLANNER}
+    returns, models, everything = swing_up(seed, report, planner)
+    real, taken = pieces_of(*episode_of(everything))
     columns = {"still": (real[1:] - real[0]).square().mean((1, 2)).sqrt()}
     for i, model in enumerate(models, start=1):
         for name, asked in (("error", model), ("mean", without_dice(model))):
             generator = torch.Generator().manual_seed(0)
             columns[f"{name}_{STEPS * i}"] = model_error_by_horizon(asked, real, taken, generator)
     rows = [{"horizon": h + 1} | {name: column[h].item() for name, column in columns.items()} for h in range(HORIZON)]
-    return Result(rows, {"returns": returns})
+    upper = (everything.next_obs[:, 0] > 0).float().view(len(returns), -1).mean(1)
+    return Result(rows, {"returns": returns, "upper": upper.tolist(), "promised": promised(models[0])})

@@ -61,8 +61,8 @@ def split_by_episode(episode_ids, fraction, generator):
     Args:
       episode_ids: which episode each step belongs to; (M,) int64, any numbers, in any
         order.
-      fraction: share of the episodes to hold out, in [0, 1]. Their number is rounded, and
-        at least one episode stays on either side.
+      fraction: share of the episodes to hold out, in [0, 1]. Their number is rounded (up or
+        down will do), and at least one episode stays on either side.
       generator: torch.Generator, the only source of randomness.
 
     Returns: (train, held_out), two complementary (M,) bool masks.

@@ -315,7 +315,26 @@ def _recursive(model, policy, start_obs, horizon, generator):
     return _stacked([start_obs, *obs], actions, rewards, continues)
 
 
+def _last_step_lost(stays):
+    """The step that ends a trajectory pays nothing, and with `stays` leads nowhere either."""
+
+    def version(model, policy, start_obs, horizon, generator):
+        dream = ch51.imagine(model, policy, start_obs, horizon, generator)
+        obs = [start_obs]
+        for following, goes_on in zip(dream["obs"][1:], dream["continues"], strict=True):
+            obs.append(torch.where(goes_on[:, None] > 0, following, obs[-1]) if stays else following)
+        return dream | {"obs": torch.stack(obs), "rewards": dream["rewards"] * dream["continues"]}
+
+    return version
+
+
+_LAST_STEP = (
+    "The step that ends a trajectory still counts: its reward is earned and its state reached. Only what comes after it does not."
+)
+
 _WRONG_IMAGINE = {
+    "last-step-unpaid": (_last_step_lost(stays=False), _LAST_STEP),
+    "last-step-not-taken": (_last_step_lost(stays=True), _LAST_STEP),
     "always-from-the-start": (
         _dream(condition=lambda start, latest: start),
         "Every step begins at start_obs again: the next one begins where the last one led to.",

@@ -825,15 +825,16 @@ def _trained(
     return _training(version, checked)
 
 
-def _optimised(make):
-    """A correct version with another optimiser and another way to draw a minibatch."""
+def _optimised(make, clearing=True):
+    """A version with another optimiser and another way to draw a minibatch; correct if gradients are cleared."""
 
     def version(network, loss_fn, obs, actions, num_steps, batch_size, learning_rate, generator):
         optimizer, losses = make(network.parameters(), lr=learning_rate), torch.zeros(num_steps)
         for step in range(num_steps):
             whole = batch_size >= len(obs)
             chosen = torch.arange(len(obs)) if whole else integers(generator, 0, len(obs), batch_size)
-            optimizer.zero_grad()
+            if clearing:
+                optimizer.zero_grad()
             loss = loss_fn(network(obs[chosen]), actions[chosen])
             losses[step] = loss.item()
             loss.backward()
@@ -863,10 +864,14 @@ def _least_squares(network, loss_fn, obs, actions, **_settings):
     network.bias.data.copy_(solution[2])
 
 
+_NOT_CLEARED = "Gradients add up from step to step: call optimizer.zero_grad() before each backward()."
+
 _WRONG_TRAIN_BC = {
-    "gradients-not-cleared": (
-        _trained(clearing=False),
-        "Gradients add up from step to step: call optimizer.zero_grad() before each backward().",
+    "gradients-not-cleared": (_trained(clearing=False), _NOT_CLEARED),
+    "gradients-not-cleared-for-adam": (_optimised(torch.optim.Adam, clearing=False), _NOT_CLEARED),
+    "all-rows-with-repetition": (
+        _trained(rows=lambda count, size, generator: integers(generator, 0, count, min(size, count))),
+        "With no more rows than batch_size a step takes each row once: this draws some twice and others not at all.",
     ),
     "no-step": (_trained(stepping=False), "The network never changes: optimizer.step() must follow backward()."),
     "uphill": (
@@ -1335,7 +1340,7 @@ _WRONG_DAGGER_ROUND = {
         "The labels lie halfway between the clone's action and the expert's: only the expert's are labels.",
     ),
     "graph-kept": (
-        {"asked": lambda expert, flown: expert(flown.obs) + 0 * flown.obs.requires_grad_().sum()},
+        {"asked": lambda expert, flown: expert(flown.obs)},
         "The answers carry the expert's graph: ask it under torch.no_grad().",
     ),
     "dtype-lost": (
@@ -1353,7 +1358,7 @@ DAGGER_ROUND = Exercise(
         Case("episodes that are cut off", _round(_ROAD, _strong), visible=True),
         Case("discrete commands", _round(_DISCRETE_ROAD, _three_commands, _three_commands)),
         Case("a single new episode", _round(_ROAD, num_episodes=1, lengths=(2, 1, 3)), visible=True),
-        Case("an expert with a graph", _round(_ROAD, expert=_strong)),
+        Case("an expert with a graph", _round(_ROAD, expert=_strong), visible=True),
         Case("a road that fills one array anew", _round(_ONE_ARRAY)),
         Case("num_episodes = 0", _round(_ROAD, num_episodes=0), raises=["num_episodes"], visible=True),
     ),
@@ -1435,6 +1440,10 @@ _WRONG_REPAIRED_PAIRS = {
     "shifted-the-wrong-way": (
         lambda obs, actions, ids: (obs[1:][_within(ids)], actions[:-1][_within(ids)]),
         "Now the observations are two steps late: each row of the log holds what came *after* its action.",
+    ),
+    "the-wrong-way-across-episodes": (
+        lambda obs, actions, ids: (obs[1:], actions[:-1]),
+        "The observations are late already, and now by two steps; and the last pair of an episode crosses into the next.",
     ),
     "across-episodes": (
         lambda obs, actions, ids: (obs[:-1], actions[1:]),

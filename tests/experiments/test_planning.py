@@ -22,17 +22,35 @@ def test_the_page_shows_the_program_that_was_recorded(tiny):
     assert (page["SETTINGS"], page["best_plan"].__defaults__) == (planning.mbpo.MBPOSettings().but(model_hidden=64), (100, 5, 4))
     page["SETTINGS"] = TINY
     returns, models, obs, actions = page["swing_up"](3, episodes=3)
-    recorded, _, recorded_obs, recorded_actions = planning.swing_up(3, lambda done, total: None, episodes=3)
+    recorded, _, everything = planning.swing_up(3, lambda done, total: None, episodes=3)
+    recorded_obs, recorded_actions = planning.episode_of(everything)
     assert returns == recorded and len(models) == 2
     assert torch.equal(obs, recorded_obs) and torch.equal(actions, recorded_actions)
 
 
 def test_rows_are_horizons_and_the_summary_has_each_return(tiny, tmp_path, monkeypatch):
     swing_up = planning.swing_up
-    monkeypatch.setattr(planning, "swing_up", lambda seed, report: swing_up(seed, report, episodes=2))
+    monkeypatch.setattr(planning, "swing_up", lambda seed, report, planner: swing_up(seed, report, planner, episodes=2))
     told = []
     result = planning.run("swing_up", 0, tmp_path, lambda done, total: told.append((done, total)))
     assert [row["horizon"] for row in result.rows] == list(range(1, 51))
     assert set(result.rows[0]) == {"horizon", "still", "error_200", "mean_200"}
     assert result.rows[0]["still"] < result.rows[19]["still"]
-    assert len(result.summary["returns"]) == 2 and told == [(1, 2), (2, 2)]
+    assert len(result.summary["returns"]) == len(result.summary["upper"]) == 2 and told == [(1, 2), (2, 2)]
+    assert all(0 <= share <= 1 for share in result.summary["upper"]) and isinstance(result.summary["promised"], float)
+
+
+def test_variants_change_how_far_is_planned_and_nothing_else(tiny, tmp_path, monkeypatch):
+    lengths = {name: given["pieces"] * given["hold"] for name, given in planning.VARIANTS.items()}
+    assert lengths == {"swing_up": 20, "plan_4": 4, "plan_8": 8, "plan_12": 12, "plan_40": 40}
+    for given in planning.VARIANTS.values():
+        assert given | {"pieces": 5} == planning.VARIANTS["swing_up"]
+    asked = []
+
+    def best_plan(model, obs, generator, **planner):
+        asked.append(planner)
+        return torch.zeros(planning.CARRIED_OUT, 1)
+
+    monkeypatch.setattr(planning, "best_plan", best_plan)
+    planning.run("plan_40", 0, tmp_path, lambda done, total: None)
+    assert asked == [{"candidates": 100, "pieces": 10, "hold": 4}] * 300
