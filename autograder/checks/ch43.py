@@ -420,6 +420,10 @@ _WRONG_CLIPPED_LOSSES = _wrong_losses(clip, ch43.clipped_surrogate_loss, _NOT_NE
         _clipped_loss(lambda r, a, e: -torch.minimum((r * a).mean(), (r.clamp(1 - e, 1 + e) * a).mean())),
         "Take the minimum sample by sample, then the mean: otherwise all samples are clipped, or none.",
     ),
+    "minimum-of-ratios": (
+        _clipped_loss(lambda r, a, e: -(torch.minimum(r, r.clamp(1 - e, 1 + e)) * a).mean()),
+        "The minimum is that of the two products, not of the ratios: times a negative advantage the larger ratio is the smaller.",
+    ),
     "clip-range-ignored": (_clipped_loss(lambda r, a, e: clip(r, a, 0.2)), _RANGE),
     "zero-range-means-off": (_clipped_loss(lambda r, a, e: clip(r, a, e or INF)), _ZERO),
     "infinity-times-zero": (
