@@ -54,7 +54,7 @@ sys.path.insert(0, str(ROOT))
 
 from autograder import checks  # noqa: E402
 from autograder.authoring import assemble, chapter, freeze  # noqa: E402
-from autograder.authoring.spec import Artefact, Exercise  # noqa: E402
+from autograder.authoring.spec import Artefact, Exercise, Tuning  # noqa: E402
 from course_lib.checks.diagnosis import diagnose  # noqa: E402
 from tests.attacks import toolbox  # noqa: E402
 
@@ -142,7 +142,7 @@ def drawn(name: str, seed: int, student: str, skill: float) -> dict[str, Any]:
     answers: dict[str, list[Any]] = {}
     for exercise in checks.exercises(name):
         right, other, which = draw.random() < skill, draw.random(), draw.randrange(1000)
-        if isinstance(exercise, Artefact):
+        if isinstance(exercise, Artefact | Tuning):
             answers[exercise.name] = ["reference" if right else "blank", 0]
         elif right:
             variant = other < 0.3 and kind != "metadata lost"

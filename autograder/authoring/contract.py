@@ -20,7 +20,7 @@ from autograder import paths
 from autograder.authoring.chapter import Cell, Chapter, ChapterError, page_files, parse
 
 if TYPE_CHECKING:
-    from autograder.authoring.spec import Artefact, Exercise
+    from autograder.authoring.spec import Artefact, Exercise, Tuning
 
 STUB = "raise NotImplementedError"
 
@@ -29,13 +29,13 @@ STUB = "raise NotImplementedError"
 class Sources:
     """What a chapter needs besides its own text."""
 
-    exercises: tuple[Exercise | Artefact, ...]
+    exercises: tuple[Exercise | Artefact | Tuning, ...]
     solutions: ModuleType
     bibliography: Path
     pages: Mapping[int, str]  # the chapters that are written, and their pages' names
     elsewhere: Mapping[str, str] = field(default_factory=dict)  # the exercises of other chapters, and where they stand
 
-    def exercise(self, name: str) -> Exercise | Artefact:
+    def exercise(self, name: str) -> Exercise | Artefact | Tuning:
         """The checks of one exercise."""
         return next(exercise for exercise in self.exercises if exercise.name == name)
 

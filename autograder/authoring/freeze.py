@@ -15,9 +15,9 @@ import numpy as np
 import torch
 
 from autograder.authoring import artefacts, complaints
-from autograder.authoring.spec import Artefact, Case, Exercise
+from autograder.authoring.spec import Artefact, Case, Exercise, Tuning
 from course_lib.checks import artefact as files
-from course_lib.checks import cells
+from course_lib.checks import cells, tuning
 from course_lib.checks.cases import FrozenCase, FrozenExercise, Observation
 from course_lib.checks.diagnosis import differing_facets, signature, view, with_article
 from course_lib.checks.observing import observe
@@ -58,12 +58,14 @@ def complete(exercise: Exercise, seed: int = 0) -> FrozenExercise:
     return _exercise(exercise, visible(exercise, seed).cases + hidden)
 
 
-def write(exercises: Iterable[Exercise | Artefact], directory: Path) -> None:
-    """Write `directory/NAME.npz` with the visible cases of each exercise; NAME.json where it is judged by a file."""
+def write(exercises: Iterable[Exercise | Artefact | Tuning], directory: Path) -> None:
+    """Write `directory/NAME.npz` with an exercise's visible cases; NAME.json where a file is judged, NAME.tuning where settings are."""
     directory.mkdir(parents=True, exist_ok=True)
     for exercise in exercises:
         if isinstance(exercise, Artefact):
             files.save(directory / f"{exercise.name}.json", artefacts.visible(exercise))
+        elif isinstance(exercise, Tuning):
+            tuning.save(directory / f"{exercise.name}.tuning", artefacts.trained_by_learners(exercise))
         else:
             save(directory / f"{exercise.name}.npz", visible(exercise))
 

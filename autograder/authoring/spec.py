@@ -1,4 +1,4 @@
-"""What a chapter's checks are made of: exercises, cases, misconceptions and correct variants, as data; and files to be flown.
+"""What a chapter's checks are made of: exercises, cases, misconceptions and correct variants, as data; files to be flown; settings.
 
 A chapter's module `autograder/checks/chNN.py` has one tuple, `EXERCISES`. The same cases run in the learner's notebook (those that
 are visible, frozen to arrays), in the judge, in the tests, and in the book's kill matrix.
@@ -125,4 +125,39 @@ class Artefact:
             f"for the file `{self.file}`, handed in beside the notebook. The grader flies it, without noise, for {self.episodes} episodes"
             f" that start from seeds of its own: no points up to a mean return of {low:g}, all of them from {high:g} on, and in between a"
             " share that grows in proportion. The file alone counts, not the function that wrote it."
+        )
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """An exercise whose function returns settings, and whose points come from training with them.
+
+    It stands in EXERCISES and has a stub in its chapter like any other. The grader trains by `train` from `episodes` seeds that nobody has
+    seen, learners by their own program from `visible_episodes` others. `thresholds` are the mean returns that earn nothing and everything.
+    """
+
+    name: str
+    reference: Callable
+    train: Callable
+    points: float
+    thresholds: tuple[float, float]
+    episodes: int = 8
+    visible_episodes: int = 4
+    experiment: str = ""  # whose trainings show that the thresholds are right: autograder.proving.calibration
+    right: str = "ours"
+    wrong: Sequence[str] = ()  # of the variants with a `mistake`, those that must not earn half
+
+    @property
+    def criteria(self) -> dict[str, float]:
+        """All points are for one thing."""
+        return {"return": self.points}
+
+    @property
+    def terms(self) -> str:
+        """What the points are for, as the notebook says it."""
+        low, high = self.thresholds
+        return (
+            f"for what is learned with these settings. The grader trains {self.episodes} times, with the course's own program, from seeds"
+            f" of its own: no points up to a mean return of {low:g}, all of them from {high:g} on, and in between a share that grows in"
+            " proportion."
         )

@@ -5,10 +5,10 @@ from __future__ import annotations
 import importlib
 import pkgutil
 
-from autograder.authoring.spec import Artefact, Exercise
+from autograder.authoring.spec import Artefact, Exercise, Tuning
 
 
-def exercises(assignment: str) -> tuple[Exercise | Artefact, ...]:
+def exercises(assignment: str) -> tuple[Exercise | Artefact | Tuning, ...]:
     """The exercises of assignment "chNN", in the chapter's order. Raises ModuleNotFoundError if it has none."""
     return importlib.import_module(f"{__name__}.{assignment}").EXERCISES
 
@@ -23,6 +23,6 @@ def assignments() -> list[str]:
     return sorted(module.name for module in pkgutil.iter_modules(__path__))
 
 
-def all_exercises() -> list[Exercise | Artefact]:
+def all_exercises() -> list[Exercise | Artefact | Tuning]:
     """The exercises of every chapter."""
     return [exercise for name in assignments() for exercise in exercises(name)]

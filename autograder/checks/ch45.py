@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -27,11 +28,11 @@ from autograder.authoring.parts import (
     versions_of,
     wrong,
 )
-from autograder.authoring.spec import Artefact, Case, Exercise
+from autograder.authoring.spec import Artefact, Case, Exercise, Misconception, Tuning
 from autograder.checks.ch43 import clip, clip_by_cases, clip_by_excess, clip_by_mask, normalised, off_bounds, plain
 from course_lib.checks.cases import built
 from course_lib.control import envs as environments
-from course_lib.control.policies import make_policy
+from course_lib.control.policies import Adam, make_policy
 from course_lib.control.rollouts import Rollout, true_next_obs
 from solutions import ch43, ch45
 
@@ -715,6 +716,428 @@ PPO_LOSS = Exercise(
     },
 )
 
+# ------------------------------------------------------------------------------------------------------- torch_ppo_steps
+
+_NETWORK = ("0", "1", "out")
+
+
+@drawing
+def _agent(generator, size=16, num_steps=1, hidden=5, small=1.0, **settings):
+    """Weights in the midst of a training, and a minibatch; float32, as networks are. `small` scales what the gradient is made of."""
+
+    def drawn(*shape):
+        return normal(generator, *shape).float().numpy()
+
+    tensors = {}
+    for network, outputs in (("actor", 2), ("critic", 1)):
+        for layer, shape in zip(_NETWORK, ((3, hidden), (hidden, hidden), (hidden, outputs)), strict=True):
+            tensors[f"{network}.{layer}.weight"] = drawn(*shape) / np.float32(math.sqrt(shape[0]))
+            tensors[f"{network}.{layer}.bias"] = np.float32(0.3) * drawn(shape[1])
+    tensors["log_std"] = np.float32(-0.6) + np.float32(0.3) * drawn(2)
+    actions = np.float32(0.7) * drawn(size, 2)
+    acted = ch45.gaussian_log_prob(torch.zeros(size, 2), torch.full((2,), -0.5), torch.from_numpy(actions)).numpy()
+    batch = {
+        "obs": drawn(size, 3),
+        "actions": actions,
+        "old_log_probs": acted + np.float32(0.2) * drawn(size),
+        "advantages": np.float32(small) * (drawn(size) + np.float32(0.3)),
+        "returns": 2 + drawn(size),
+    }
+    chosen = {"learning_rate": 0.01, "max_grad_norm": 0.5, "ent_coef": 0.05} | settings
+    return {
+        "tensors": tensors,
+        "batch": built("control.ppo.Batch", **batch),
+        "settings": built("control.ppo.PPOSettings", **chosen),
+        "num_steps": num_steps,
+    }
+
+
+def _by_library(tensors, batch, settings, num_steps=1):
+    """The course's own policy and Adam, in which no torch.nn and no torch.optim occurs."""
+    (obs_dim, hidden), action_dim = tensors["actor.0.weight"].shape, len(tensors["log_std"])
+    policy, optimizer, losses = make_policy(obs_dim, action_dim, hidden=hidden), Adam(settings.learning_rate), []
+    for name, tensor in policy.tensors().items():
+        tensor.copy_(tensors[name])
+    for _ in range(num_steps):
+        loss, _ = _loss(policy, batch, settings)
+        _afresh(policy, loss)
+        optimizer.step(policy, settings.max_grad_norm)
+        losses.append(loss.detach())
+    return torch.stack(losses), {name: tensor.clone() for name, tensor in policy.tensors().items()}
+
+
+def _of_both(agent, obs, tanh):
+    return agent.actor(obs, tanh), agent.critic(obs, tanh)[:, 0]
+
+
+class _Network(torch.nn.Module):
+    """Three layers, from weights as the library keeps them."""
+
+    def __init__(self, tensors, name, turn):
+        super().__init__()
+        for layer in _NETWORK:
+            weight, bias = (tensors[f"{name}.{layer}.{part}"] for part in ("weight", "bias"))
+            linear = torch.nn.Linear(*weight.shape)
+            with torch.no_grad():
+                linear.weight.copy_(turn(weight))
+                linear.bias.copy_(bias)
+            self.add_module(layer, linear)
+
+    def forward(self, obs, tanh=torch.tanh):
+        first, second, last = (getattr(self, layer) for layer in _NETWORK)
+        return last(tanh(second(tanh(first(obs)))))
+
+
+class _Agent(torch.nn.Module):
+    def __init__(self, tensors, turn, log_std):
+        super().__init__()
+        self.actor, self.critic = (_Network(tensors, name, turn) for name in ("actor", "critic"))
+        self.log_std = log_std(tensors["log_std"])
+
+
+def _kept_weights(agent, turn):
+    kept = dict(agent.state_dict()) | {"log_std": agent.log_std.detach()}
+    return {name: (turn(x) if x.dim() == 2 else x).clone() for name, x in kept.items()}
+
+
+def _adam(parameters, settings):
+    return torch.optim.Adam(parameters, lr=settings.learning_rate, eps=1e-5)
+
+
+def _zeroed(optimizer, loss):
+    optimizer.zero_grad()
+    loss.backward()
+
+
+def _norm_clipped(parameters, most):
+    torch.nn.utils.clip_grad_norm_(parameters, most)
+
+
+def _density_of_row(mean, log_std, actions, old):
+    return ch45.gaussian_log_prob(mean, log_std, actions), old
+
+
+def _by_ppo_loss(agent, out, log_std, batch, settings, density, values):
+    log_probs, old = density(out[0], log_std, batch.actions, batch.old_log_probs)
+    judged, returns, advantages = values(out[1], batch.returns, batch.advantages)
+    entropy = ch45.gaussian_entropy(log_std)
+    policy = clip((log_probs - old).exp(), advantages, settings.clip_range)
+    return policy + settings.vf_coef * (judged - returns).square().mean() - settings.ent_coef * entropy
+
+
+def _torch_steps(
+    turn=lambda weight: weight.T,
+    log_std=lambda given: torch.nn.Parameter(given.clone()),
+    scale=lambda log_std: log_std,
+    forward=_of_both,
+    tanh=torch.tanh,
+    density=_density_of_row,
+    values=lambda values, returns, advantages: (values, returns, advantages),
+    sign=1,
+    learned=lambda agent: list(agent.parameters()),
+    optimiser=_adam,
+    afresh=False,
+    differentiate=_zeroed,
+    bound=_norm_clipped,
+    told=lambda losses: torch.stack(losses).detach(),
+    late=0,
+    kept=_kept_weights,
+    checked=True,
+):
+    """A version of the program, from the places where it can go wrong."""
+
+    def version(tensors, batch, settings, num_steps=1):
+        if checked and num_steps < 1:
+            raise ValueError(f"num_steps = {num_steps}")
+        agent, losses = _Agent(tensors, turn, log_std), []
+        parameters = learned(agent)
+        optimizer = optimiser(parameters, settings)
+        for _ in range(num_steps + late):
+            if afresh:
+                optimizer = optimiser(parameters, settings)
+            out = forward(agent, batch.obs, tanh)
+            loss = _by_ppo_loss(agent, out, scale(agent.log_std), batch, settings, density, values)
+            losses.append(loss)
+            if len(losses) > num_steps:
+                break
+            differentiate(optimizer, sign * loss)
+            bound(parameters, settings.max_grad_norm)
+            optimizer.step()
+        return told(losses[late:]), kept(agent, turn)
+
+    return version
+
+
+def _own_epsilon(parameters, settings):
+    return torch.optim.Adam(parameters, settings.learning_rate)
+
+
+def _onto_what_is_there(optimizer, loss):
+    loss.backward()
+
+
+def _no_bound(parameters, most):
+    pass
+
+
+_FOUR_LINES = "A step is zero_grad(), backward(), clip_grad_norm_(), step(), by torch.optim.Adam(…, eps=1e-5): here "
+
+
+def _one_trunk(agent, obs, tanh):
+    """The critic's last layer on the actor's hidden ones."""
+    hidden = tanh(agent.actor.get_submodule("1")(tanh(agent.actor.get_submodule("0")(obs))))
+    return agent.actor.out(hidden), agent.critic.out(hidden)[:, 0]
+
+
+def _clipped_by_value(parameters, most):
+    torch.nn.utils.clip_grad_value_(parameters, most)
+
+
+def _each_clipped(parameters, most):
+    for parameter in parameters:
+        torch.nn.utils.clip_grad_norm_([parameter], most)
+
+
+def _averaged_density(mean, log_std, actions, old):
+    return ch45.gaussian_log_prob(mean, log_std, actions) / actions.shape[1], old
+
+
+def _a_ratio_for_each_component(mean, log_std, actions, old):
+    z = (actions - mean) / log_std.exp()
+    return -0.5 * z**2 - log_std - HALF_LOG_TWO_PI, old[:, None]
+
+
+def _aliased(given):
+    return torch.nn.Parameter(given)
+
+
+def _by_hand_in_torch(tensors, batch, settings, num_steps=1):
+    """A variant: a ParameterDict, products in place of layers, the density and the loss of torch's own, the norm clipped by hand."""
+    if num_steps < 1:
+        raise ValueError("num_steps is too small")
+    agent = torch.nn.ParameterDict({name.replace(".", "_"): tensor.clone() for name, tensor in tensors.items()})
+    optimizer, losses = torch.optim.Adam(agent.values(), settings.learning_rate, eps=1e-5), []
+
+    def network(name, x):
+        for layer in _NETWORK:
+            x = x @ agent[f"{name}_{layer}_weight"] + agent[f"{name}_{layer}_bias"]
+            x = x if layer == "out" else torch.tanh(x)
+        return x
+
+    for _ in range(num_steps):
+        policy = Independent(Normal(network("actor", batch.obs), agent["log_std"].exp()), 1)
+        ratio = (policy.log_prob(batch.actions) - batch.old_log_probs).exp()
+        bounded = ratio.clamp(1 - settings.clip_range, 1 + settings.clip_range)
+        gain = torch.min(ratio * batch.advantages, bounded * batch.advantages).mean()
+        error = torch.nn.functional.mse_loss(network("critic", batch.obs).squeeze(-1), batch.returns)
+        loss = -gain + settings.vf_coef * error - settings.ent_coef * policy.entropy().mean()
+        gradients = torch.autograd.grad(loss, list(agent.values()))
+        norm = torch.stack([gradient.square().sum() for gradient in gradients]).sum().sqrt()
+        for parameter, gradient in zip(agent.values(), gradients, strict=True):
+            parameter.grad = gradient * min(1.0, settings.max_grad_norm / (norm.item() + 1e-6))
+        optimizer.step()
+        losses.append(loss.item())
+    return torch.tensor(losses), {name: agent[name.replace(".", "_")].detach() for name in tensors}
+
+
+def _two_optimisers(parameters, settings):
+    """A variant: Adam treats every number apart, so that two of them do what one does."""
+
+    class Both:
+        parts = (_adam(parameters[:7], settings), _adam(parameters[7:], settings))
+
+        def zero_grad(self):
+            for part in self.parts:
+                part.zero_grad(set_to_none=False)
+
+        def step(self):
+            for part in self.parts:
+                part.step()
+
+    return Both()
+
+
+def _onto_zeros(optimizer, loss):
+    """A variant: torch.autograd adds to zeros."""
+    optimizer.zero_grad(set_to_none=False)
+    torch.autograd.backward([loss])
+
+
+_WRONG_TORCH_STEPS = {
+    "gradient-never-cleared": (
+        {"differentiate": _onto_what_is_there},
+        "The first step is right and the later ones are not: backward() adds to the gradients that are there. optimizer.zero_grad() "
+        "before it clears them.",
+    ),
+    "one-trunk": (
+        {"forward": _one_trunk},
+        "The critic's last layer reads the actor's hidden layers: the two networks share nothing, and critic.0 and critic.1 are used.",
+    ),
+    "log-std-not-a-parameter": (
+        {"log_std": lambda given: given.clone().requires_grad_()},
+        "log_std stays where it began. A tensor with requires_grad is none of the module's parameters, so the optimiser never gets it: "
+        "wrap it in torch.nn.Parameter.",
+    ),
+    "log-std-taken-as-std": (
+        {"scale": lambda log_std: log_std.abs().log()},
+        "log_std is the logarithm of σ: the density and the entropy take it as it is, or its exponential as σ.",
+    ),
+    "log-probs-averaged": (
+        {"density": _averaged_density},
+        "The log-probability of an action is the sum over its components; this is their mean, and no ratio begins near 1.",
+    ),
+    "log-probs-not-summed": (
+        {
+            "density": _a_ratio_for_each_component,
+            "values": lambda values, returns, advantages: (values, returns, advantages[:, None]),
+        },
+        "Each component has a ratio of its own: the log-densities are summed over the last axis first, (B, A) to (B,).",
+    ),
+    "values-as-a-column": (
+        {"values": lambda values, returns, advantages: (values[:, None], returns, advantages)},
+        "The critic's output is a column (B, 1), which against returns (B,) broadcasts to all pairs: squeeze its last axis.",
+    ),
+    "maximises": (
+        {"sign": -1},
+        "The weights go uphill: optimisers minimise, so hand loss.backward() the loss itself. Its minus signs are in ppo_loss.",
+    ),
+    "gradient-not-clipped": (
+        {"bound": _no_bound},
+        "The gradient's norm is not bounded, or only once the step is made: torch.nn.utils.clip_grad_norm_ between backward() and step().",
+    ),
+    "gradient-clipped-by-value": (
+        {"bound": _clipped_by_value},
+        "Each number of the gradient is cut off by itself, which turns its direction. The norm of the whole is what is bounded: "
+        "clip_grad_norm_, not clip_grad_value_.",
+    ),
+    "gradient-clipped-tensor-by-tensor": (
+        {"bound": _each_clipped},
+        "Each tensor's gradient has a bound of its own: it is the joint norm over all parameters that is bounded, in one call.",
+    ),
+    "weights-not-turned": (
+        {"turn": lambda weight: weight.reshape(weight.shape[::-1])},
+        "torch.nn.Linear computes inputs @ weight.T + bias and keeps its weight as (outputs, inputs): transpose, both ways. A reshape "
+        "mixes the numbers, and a square matrix fits without either.",
+    ),
+    "rectifiers": (
+        {"tanh": torch.relu},
+        "There are rectifiers between the layers: these networks have tanh, which is where their weights come from.",
+    ),
+    "tanh-behind-the-last-layer": (
+        {"forward": lambda agent, obs, tanh: tuple(map(torch.tanh, _of_both(agent, obs, tanh)))},
+        "There is a tanh behind the last layer: no value could leave [-1, 1]. Behind the hidden layers only.",
+    ),
+    "stochastic-gradient-descent": (
+        {"optimiser": lambda parameters, settings: torch.optim.SGD(parameters, settings.learning_rate)},
+        "These are steps along the gradient itself. Adam divides by its running size: torch.optim.Adam.",
+    ),
+    "adams-own-epsilon": (
+        {"optimiser": _own_epsilon},
+        "Adam's ε is 1e-8 unless you say otherwise: with eps=1e-5, as PPO programs have it, tiny gradients make smaller steps.",
+    ),
+    "neither-bound-nor-epsilon": (
+        {"optimiser": _own_epsilon, "bound": _no_bound},
+        _FOUR_LINES + "the gradient's norm is not bounded, and Adam's ε is PyTorch's 1e-8.",
+    ),
+    "neither-cleared-nor-epsilon": (
+        {"optimiser": _own_epsilon, "differentiate": _onto_what_is_there},
+        _FOUR_LINES + "gradients add up from step to step, and Adam's ε is PyTorch's 1e-8.",
+    ),
+    "neither-cleared-nor-bounded": (
+        {"bound": _no_bound, "differentiate": _onto_what_is_there},
+        _FOUR_LINES + "gradients add up from step to step, and their norm is not bounded.",
+    ),
+    "backward-and-step-alone": (
+        {"optimiser": _own_epsilon, "bound": _no_bound, "differentiate": _onto_what_is_there},
+        _FOUR_LINES + "gradients add up, their norm is not bounded, and Adam's ε is PyTorch's 1e-8.",
+    ),
+    "learning-rate-forgotten": (
+        {"optimiser": lambda parameters, settings: torch.optim.Adam(parameters, eps=1e-5)},
+        "The learning rate is PyTorch's 0.001: lr=settings.learning_rate.",
+    ),
+    "optimiser-made-anew": (
+        {"afresh": True},
+        "The optimiser is made inside the loop: Adam forgets its averages, and every step is as large as the first.",
+    ),
+    "actor-alone-learns": (
+        {"learned": lambda agent: [*agent.actor.parameters(), agent.log_std]},
+        "The critic's weights stay where they began: give the optimiser all of the module's parameters.",
+    ),
+    "losses-after-the-steps": (
+        {"late": 1},
+        "Each loss is that after its step: the first one belongs to the weights as they came.",
+    ),
+    "weights-as-linear-keeps-them": (
+        {"kept": lambda agent, turn: _kept_weights(agent, lambda weight: weight)},
+        "The weights come back as torch.nn.Linear keeps them, (outputs, inputs): turn them round again, `tensors` has (inputs, outputs).",
+    ),
+    "graph-kept": (
+        {"told": torch.stack},
+        "The losses carry a graph, and with it the activations of every step: detach what you only report.",
+    ),
+    "callers-weights-changed": (
+        {"log_std": _aliased},
+        "torch.nn.Parameter(x) shares x's memory, and the optimiser writes into it: clone what the caller has handed you.",
+    ),
+}
+
+
+TORCH_PPO_STEPS = Exercise(
+    name="torch_ppo_steps",
+    reference=ch45.torch_ppo_steps,
+    criteria={"values": 2.3, "gradient": 0.2, "dtype": 0.1, "inputs": 0.3, "errors": 0.1},
+    cases=(
+        _case(
+            "learning rate 0: the loss, and the weights as they came",
+            _agent(learning_rate=0.0),
+            closed_form=_by_library,
+            visible=True,
+            draws=1,
+        ),
+        _case("one step, no bound that matters", _agent(max_grad_norm=1e6), closed_form=_by_library, visible=True),
+        _case(
+            "a step on advantages near 0", _agent(small=1e-5, vf_coef=0.0, ent_coef=0.0), closed_form=_by_library, visible=True
+        ),
+        _case("five steps, no bound that matters", _agent(max_grad_norm=1e6, num_steps=5), closed_form=_by_library, visible=True),
+        _case("five steps with a bound", _agent(num_steps=5), closed_form=_by_library, visible=True),
+        _case("a tight bound on the gradient", _agent(max_grad_norm=1e-4, num_steps=2), closed_form=_by_library),
+        _case(
+            "other settings",
+            _agent(clip_range=0.05, vf_coef=2.0, ent_coef=0.3, learning_rate=0.03, num_steps=3),
+            closed_form=_by_library,
+        ),
+        _case("as many hidden units as observations", _agent(hidden=3, num_steps=2), closed_form=_by_library),
+        _case("num_steps = 0", _agent(num_steps=0), raises=("num_steps",), visible=True),
+    ),
+    misconceptions=(
+        *wrong(_WRONG_TORCH_STEPS, lambda parts: _torch_steps(**parts)),
+        Misconception(
+            "weights-as-they-came",
+            lambda tensors, *others, **named: (
+                ch45.torch_ppo_steps(tensors, *others, **named)[0],
+                {name: tensor.clone() for name, tensor in tensors.items()},
+            ),
+            "The weights that come back are those that went in: read them from the module after the last step.",
+        ),
+        Misconception(
+            "dtype-lost",
+            after(ch45.torch_ppo_steps, lambda found: (found[0].double(), {name: x.double() for name, x in found[1].items()})),
+            DTYPE,
+        ),
+        bad_input_accepted(
+            _torch_steps(checked=False, told=lambda losses: torch.stack(losses or [torch.zeros(())]).detach()),
+            "Without a step there is no loss to report: raise a ValueError that names num_steps and its value.",
+        ),
+    ),
+    variants={
+        "two modules in a module": _torch_steps(),
+        "a dict of parameters, torch's own density and loss": _by_hand_in_torch,
+        "two optimisers": _torch_steps(optimiser=_two_optimisers),
+        "gradients set to zero": _torch_steps(differentiate=_onto_zeros),
+        "the course's own networks": versions_of(ch45.torch_ppo_steps, satisfies(lambda num_steps: num_steps >= 1))(_by_library),
+    },
+)
+
 # ------------------------------------------------------------------------------------------------------- collect_rollout
 
 
@@ -1223,4 +1646,32 @@ TRAIN_PPO = Artefact(
     wrong=("broken_sign_flipped", "broken_misaligned", "broken_ratio_inverted", "broken_mean_action"),
 )
 
-EXERCISES = (GAUSSIAN_LOG_PROB, GAUSSIAN_ENTROPY, COLLECT_ROLLOUT, MINIBATCHES, PPO_LOSS, PPO_UPDATE, TRAIN_PPO, REPAIRED_ROLLOUT)
+TUNED_SETTINGS = Tuning(
+    name="tuned_settings",
+    reference=ch45.tuned_settings,
+    train=partial(ch45.train_ppo, update=ch45.fast_ppo_update),
+    points=2.0,
+    thresholds=(20.0, 46.0),
+    experiment="tuned",
+    wrong=(
+        "broken_nothing",
+        "broken_only_num_steps",
+        "broken_only_minibatch_size",
+        "broken_only_num_epochs",
+        "broken_only_learning_rate",
+        "broken_only_clip_range",
+    ),
+)
+
+EXERCISES = (
+    GAUSSIAN_LOG_PROB,
+    GAUSSIAN_ENTROPY,
+    COLLECT_ROLLOUT,
+    MINIBATCHES,
+    PPO_LOSS,
+    TORCH_PPO_STEPS,
+    PPO_UPDATE,
+    TRAIN_PPO,
+    TUNED_SETTINGS,
+    REPAIRED_ROLLOUT,
+)

@@ -23,7 +23,7 @@ from nbformat import NotebookNode
 
 from autograder import checks
 from autograder.authoring import artefacts, assemble, chapter, contract, freeze
-from autograder.authoring.spec import Artefact
+from autograder.authoring.spec import Artefact, Exercise, Tuning
 from autograder.grading import flights, forking, intake, repair
 from autograder.grading.attempts import Attempt, Past, plan, share, suspect
 from autograder.grading.sandbox import Sandbox, SandboxDied, SandboxError, SandboxGarbage, SandboxTimeout, SandboxUnavailable
@@ -36,6 +36,7 @@ from course_lib.checks.names import WORD
 from course_lib.checks.notebook import NAMED, Stop, is_check, is_live
 from course_lib.checks.notebook import needed as needed_stops
 from course_lib.checks.stored import decode, encode
+from course_lib.checks.tuning import FrozenTuning, judged
 
 WORKER = Path(__file__).with_name("worker.py")
 START_SECONDS = 120.0  # importing torch on a busy machine; nothing of the learner's has run by then
@@ -89,10 +90,7 @@ def _released(assignment: str) -> Released:
     page = chapter.load(assignment)
     sources = contract.sources(page, alone=True)
     outline = assemble.outline(page, sources)
-    exercises = tuple(
-        artefacts.hidden(exercise) if isinstance(exercise, Artefact) else freeze.complete(exercise)
-        for exercise in checks.exercises(assignment)
-    )
+    exercises = tuple(_frozen(exercise) for exercise in checks.exercises(assignment))
     names = {exercise.name for exercise in exercises}
     tests = {f"test_{name}" for name in names}
     questions = {name for name, _ in outline.open_questions}
@@ -109,6 +107,12 @@ def _released(assignment: str) -> Released:
         repair.form(notebook),
         notebook,
     )
+
+
+def _frozen(exercise: Exercise | Artefact | Tuning) -> FrozenExercise | FrozenArtefact:
+    if isinstance(exercise, Tuning):
+        return artefacts.trained_by_grader(exercise)
+    return artefacts.hidden(exercise) if isinstance(exercise, Artefact) else freeze.complete(exercise)
 
 
 @functools.cache
@@ -429,6 +433,10 @@ class _Run:
 
     def _compared(self, exercise: FrozenExercise, seen: list[Observation]) -> Finding:
         try:
+            if isinstance(exercise, FrozenTuning) and exercise.train:
+                return judged(
+                    exercise, seen[0], exercise.train
+                )  # numbers in known ranges come from the sandbox; the training is ours
             return diagnose(exercise, [view(case, one) for case, one in zip(exercise.cases, seen, strict=True)])
         except Exception as error:  # no answer, however odd, may end the grading; a person must look at this one
             self._flag(f"{NOT_COMPARED}: {exercise.name} ({type(error).__name__})")

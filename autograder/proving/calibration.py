@@ -1,5 +1,7 @@
 """Where the thresholds of an exercise that is judged by a file come from: agents trained rightly and wrongly, and how they flew.
 
+Where settings are judged, an agent is a set of as many trainings with them as the judge makes, and an episode is one training.
+
 The bar: of right agents, at most one in a hundred earns less than all points; of those with a mistake that a flight must show
 (`Artefact.wrong`), none earns half of them, and of further ones at most one in twenty, which is as much as five agents can show.
 Other mistakes let an agent land all the same: only the checks of functions find those, and the table says how often they land. A
@@ -23,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from autograder.authoring.spec import Artefact
+from autograder.authoring.spec import Artefact, Tuning
 from course_lib.figures import records
 
 BAR, BAR_WRONG = 0.01, 0.05
@@ -55,7 +57,7 @@ class Row:
     chance: float
 
 
-def groups(artefact: Artefact, runs: Path | None = None) -> list[Group]:
+def groups(artefact: Artefact | Tuning, runs: Path | None = None) -> list[Group]:
     """The agents of the artefact's experiment that were trained for this, with the returns of their recorded evaluation.
 
     Args:
@@ -71,7 +73,7 @@ def groups(artefact: Artefact, runs: Path | None = None) -> list[Group]:
     return sorted(found, key=lambda group: (bool(group.mistake), group.variant not in artefact.wrong))
 
 
-def rows(artefact: Artefact, found: Sequence[Group]) -> list[Row]:
+def rows(artefact: Artefact | Tuning, found: Sequence[Group]) -> list[Row]:
     """What the groups say about the artefact's thresholds."""
     low, high = artefact.thresholds
     half, result = (low + high) / 2, []
@@ -84,13 +86,14 @@ def rows(artefact: Artefact, found: Sequence[Group]) -> list[Row]:
     return result
 
 
-def printed(artefact: Artefact) -> dict[str, Any]:
+def printed(artefact: Artefact | Tuning) -> dict[str, Any]:
     """The rows as the book prints them, as plain data."""
     return {
         "exercise": artefact.name,
         "thresholds": list(artefact.thresholds),
         "episodes": artefact.episodes,
         "wrong": list(artefact.wrong),
+        "of": "trainings" if isinstance(artefact, Tuning) else "episodes",
         "agents": [asdict(row) for row in rows(artefact, groups(artefact))],
     }
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from autograder import checks
-from autograder.authoring.spec import Artefact, Exercise
+from autograder.authoring.spec import Artefact, Exercise, Tuning
 from autograder.paths import ROOT, RUNS
 from autograder.proving.dependencies import Code, definition_of
 from autograder.proving.killmatrix import SEEDS
@@ -48,7 +48,7 @@ class Keys:
         self.root, self.code = root, Code(root)
         self._pins = pins(root)
 
-    def key(self, assignment: str, exercise: Exercise | Artefact) -> str:
+    def key(self, assignment: str, exercise: Exercise | Artefact | Tuning) -> str:
         """A hash of all that an exercise's proof rests on."""
         module, kind = f"autograder.checks.{assignment}", type(exercise).__name__
         source = (self.root / "autograder" / "checks" / f"{assignment}.py").read_text(encoding="utf-8")
@@ -59,7 +59,7 @@ class Keys:
         digest = hashlib.sha256(f"{reached.fingerprint} {SEEDS}".encode())
         for package in sorted(used):
             digest.update(f"{package}=={self._pins[package]}\n".encode())
-        if isinstance(exercise, Artefact):  # its proof are the flights of recorded agents
+        if isinstance(exercise, Artefact | Tuning):  # its proof are the flights of recorded agents
             for path in sorted((RUNS / exercise.experiment).glob("*.parquet")):
                 digest.update(path.name.encode() + hashlib.sha256(path.read_bytes()).digest())
         return digest.hexdigest()[:16]

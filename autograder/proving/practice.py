@@ -21,7 +21,7 @@ from autograder import checks
 from autograder.authoring import chapter as chapters
 from autograder.authoring import contract
 from autograder.authoring.chapter import Chapter
-from autograder.authoring.spec import Artefact, Exercise
+from autograder.authoring.spec import Artefact, Exercise, Tuning
 from autograder.paths import COURSE_LIB, ROOT
 from autograder.proving import kept
 
@@ -98,7 +98,7 @@ def answers(chapter: Chapter) -> dict[str, str]:
     return {name: f"{one.signature}\n{one.docstring}\n{one.body}\n" for name, one in found.items()}
 
 
-def _text(exercise: Exercise | Artefact) -> str:
+def _text(exercise: Exercise | Artefact | Tuning) -> str:
     from autograder.authoring import freeze
     from course_lib.checks import stored
 
@@ -127,10 +127,12 @@ class Agreement:
         return not self.reason
 
 
-def out_of_reach(exercise: Exercise | Artefact) -> str:
+def out_of_reach(exercise: Exercise | Artefact | Tuning) -> str:
     """Why an exercise is none for the page, whatever its answers; "" if it may be one."""
     if isinstance(exercise, Artefact):
         return "a file is judged, and no function"
+    if isinstance(exercise, Tuning):
+        return "settings are judged by training with them, for which there is no PyTorch"
     if any(case.view for case in exercise.cases if case.visible):
         return "many answers are right, and what they have in common is looked at with NumPy"
     import torch
@@ -209,7 +211,7 @@ def _on_the_page(chapter: Chapter, exercises: list[Exercise]) -> dict[str, list]
 class Keys(kept.Keys):
     """The keys of what the page can judge."""
 
-    def key(self, assignment: str, exercise: Exercise | Artefact) -> str:
+    def key(self, assignment: str, exercise: Exercise | Artefact | Tuning) -> str:
         """A hash of all that it rests on: the exercise and its checks, the comparing code, the page's modules, the chapter's cells."""
         own = super().key(assignment, exercise)
         return hashlib.sha256(f"{own} {self._page} {self._chapter(assignment)}".encode()).hexdigest()[:16]

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from autograder import checks
-from autograder.authoring.spec import Artefact, Exercise
+from autograder.authoring.spec import Artefact, Exercise, Tuning
 from autograder.proving import calibration, kept, killmatrix, side_by_side
 from autograder.proving.killmatrix import SEEDS
 
@@ -80,7 +80,9 @@ def draw(part: Part) -> killmatrix.ExerciseRows | dict[str, Any]:
 
     torch.set_num_threads(1)  # right for small tensors, and parts share the machine
     exercise = _exercise(part.target)
-    return calibration.printed(exercise) if isinstance(exercise, Artefact) else killmatrix.exercise_rows(exercise, part.seeds)
+    if isinstance(exercise, Exercise):
+        return killmatrix.exercise_rows(exercise, part.seeds)
+    return calibration.printed(exercise)
 
 
 def prove(
@@ -145,12 +147,12 @@ def table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return lines
 
 
-def _exercise(target: Target) -> Exercise | Artefact:
+def _exercise(target: Target) -> Exercise | Artefact | Tuning:
     return next(one for one in checks.exercises(target.assignment) if one.name == target.exercise)
 
 
 def _parts(target: Target, seeds: Sequence[int]) -> list[Part]:
-    if isinstance(_exercise(target), Artefact):
+    if not isinstance(_exercise(target), Exercise):
         return [Part(target, ())]
     return [Part(target, tuple(seeds[start : start + PART])) for start in range(0, len(seeds), PART)]
 
@@ -161,7 +163,7 @@ def _outcome(target: Target, ended: Sequence[side_by_side.Done]) -> Outcome:
         return Outcome(target, broken=list(dict.fromkeys(broken)))
     found: list[Any] = [one.result for one in ended]
     exercise = _exercise(target)
-    if isinstance(exercise, Artefact):
+    if not isinstance(exercise, Exercise):
         return Outcome(target, found[0], calibration.report(found[0], exercise.right))
     rows = killmatrix.merged(found)
     return Outcome(target, rows.as_printed(), killmatrix.report(rows))

@@ -308,19 +308,25 @@ def kill_matrix_page(matrix: dict[str, list[dict]]) -> str:
 
 
 def _agents(row: dict) -> list[str]:
-    """The part of the appendix on an exercise that is judged by a file."""
+    """The part of the appendix on an exercise that is judged by a file, or by training."""
     low, high = row["thresholds"]
     table = [
         f"| {_plain(group['mistake']) or 'trained rightly'} | {_must_fail(group, row)} | {group['agents']} |"
         f" {group['least']:.0f} | {group['middle']:.0f} | {group['most']:.0f} | {group['full']} | {group['half']} | {group['chance']:.1%} |"
         for group in row["agents"]
     ]
+    about = (
+        f"Mean returns of {row['episodes']} trainings, as many as the grader makes, in sets that differ in their seeds; how many earn all"
+        " points, and how many half or more."
+        if row.get("of") == "trainings"
+        else f"Mean returns of {row['episodes']} recorded episodes, of"
+        " agents that differ in the seed of their training; how many earn all points, and how many half or more. Some mistakes let an"
+        " agent land all the same: what a file does in flight cannot show them, and the checks of the functions do."
+    )
     return [
         f"### `{row['exercise']}`",
         "",
-        f"Points grow from none at a mean return of {low:g} to all at {high:g}. Mean returns of {row['episodes']} recorded episodes, of"
-        " agents that differ in the seed of their training; how many earn all points, and how many half or more. Some mistakes let an"
-        " agent land all the same: what a file does in flight cannot show them, and the checks of the functions do. The last column"
+        f"Points grow from none at a mean return of {low:g} to all at {high:g}. {about} The last column"
         " estimates the chance that a further agent goes wrong: that a right one earns less than all points, and that one with a"
         " mistake earns half or more.",
         "",

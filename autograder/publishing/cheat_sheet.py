@@ -1,8 +1,9 @@
 """The appendix with every loss and estimator, to print: written from the docstrings of stubs, which are those of the references.
 
 By rule all exercises are on it that compute something: not the repairs of bug labs (`repaired_…`), nor procedures, which are handed
-something that acts or learns (an argument in `ACTORS`) and are only named. A docstring gives its first paragraph; the first paragraph that
-is indented further, which is the formula; and the shapes of arguments and return. What it lacks is said on the page and on stderr.
+something that acts or learns (an argument in `ACTORS`), or nothing at all, and are only named. A docstring gives its first paragraph; the
+first paragraph that is indented further, which is the formula; and the shapes of arguments and return. What it lacks is said on the page
+and on stderr.
 """
 
 from __future__ import annotations
@@ -119,7 +120,8 @@ def _function(cell: Cell) -> ast.FunctionDef:
 
 def _is_procedure(cell: Cell) -> bool:
     is_repair = str(cell.exercise).startswith("repaired_")
-    return not is_repair and any(argument.arg in ACTORS for argument in _function(cell).args.args)
+    arguments = [argument.arg for argument in _function(cell).args.args]
+    return not is_repair and (not arguments or any(name in ACTORS for name in arguments))
 
 
 def _arguments(cell: Cell, node: ast.FunctionDef, text: str) -> Iterator[str]:

@@ -13,10 +13,11 @@ from pathlib import Path
 
 from autograder import checks
 from autograder.authoring import artefacts, freeze
-from autograder.authoring.spec import Artefact
+from autograder.authoring.spec import Artefact, Tuning
 from course_lib.checks.artefact import FrozenArtefact, judge_here
 from course_lib.checks.cases import FrozenExercise
 from course_lib.checks.diagnosis import examine
+from course_lib.checks.tuning import FrozenTuning, examine_here
 
 
 def score(name: str, function: Callable) -> float:
@@ -26,10 +27,14 @@ def score(name: str, function: Callable) -> float:
     """
     with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
         frozen = _frozen(name)
-        return (judge_here(frozen, Path()) if isinstance(frozen, FrozenArtefact) else examine(frozen, function)).score
+        if isinstance(frozen, FrozenArtefact):
+            return judge_here(frozen, Path()).score
+        return (examine_here(frozen, function) if isinstance(frozen, FrozenTuning) else examine(frozen, function)).score
 
 
 @functools.cache
 def _frozen(name: str) -> FrozenExercise | FrozenArtefact:
     exercise = next(exercise for exercise in checks.all_exercises() if exercise.name == name)
+    if isinstance(exercise, Tuning):
+        return artefacts.trained_by_grader(exercise)
     return artefacts.hidden(exercise) if isinstance(exercise, Artefact) else freeze.complete(exercise)

@@ -44,7 +44,7 @@ def check(function: Callable) -> CheckResult:
 
 
 def _check_function(name: str, function: Callable) -> CheckResult:
-    result = examined(visible_cases(name), function)
+    result = _trained(name, function) if is_judged_by_training(name) else examined(visible_cases(name), function)
     if result.finding.state == "error":
         result.finding.message = "; ".join([result.finding.message, *_cells_to_run(result.finding.message)])
     if not result.passed:
@@ -81,6 +81,19 @@ def is_judged_by_file(name: str) -> bool:
     return (FROZEN / f"{name}.json").is_file()
 
 
+def is_judged_by_training(name: str) -> bool:
+    """Whether the points of the exercise `name` come from training with what its function returns."""
+    return (FROZEN / f"{name}.tuning").is_file()
+
+
+def _trained(name: str, function: Callable) -> CheckResult:
+    from course_lib.checks import tuning  # as with files
+
+    finding = tuning.examine_here(tuning.load(FROZEN / f"{name}.tuning"), function)
+    finding.message = tuning.told_here(finding)
+    return CheckResult(finding, finding.message)
+
+
 def check_file(name: str) -> CheckResult:
     """Fly the file of the exercise `name` that lies in the working directory: a few episodes, in seconds."""
     from course_lib.checks import artefact  # Gymnasium takes a third of a second, which no other check should cost
@@ -110,4 +123,4 @@ def visible_cases(name: str) -> FrozenExercise:
 
 def exercise_names() -> list[str]:
     """The names of all exercises that can be checked here."""
-    return sorted(path.stem for suffix in ("npz", "json") for path in FROZEN.glob(f"*.{suffix}"))
+    return sorted(path.stem for suffix in ("npz", "json", "tuning") for path in FROZEN.glob(f"*.{suffix}"))

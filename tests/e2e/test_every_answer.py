@@ -16,13 +16,13 @@ import nbformat
 import pytest
 
 from autograder import checks
-from autograder.authoring.spec import Artefact
+from autograder.authoring.spec import Artefact, Exercise
 from autograder.paths import ROOT
 from autograder.publishing import release
 
 CHAPTER = os.environ.get("COURSE_ONLY", "ch44")
 ALL = checks.exercises(CHAPTER)
-EXERCISES = {number: exercise for number, exercise in enumerate(ALL) if not isinstance(exercise, Artefact)}
+EXERCISES = {number: exercise for number, exercise in enumerate(ALL) if isinstance(exercise, Exercise)}
 MISTAKES = max((len(exercise.misconceptions) for exercise in EXERCISES.values()), default=0)
 VARIANTS = max((len(exercise.variants) for exercise in EXERCISES.values()), default=0)
 POINTS = sum(exercise.points for exercise in ALL)
@@ -45,8 +45,8 @@ def filled_in(released, source):
 
 
 def taken(number, exercise, which):
-    """A cell that takes a function of the checks' module; of what is judged by a file, the reference."""
-    if isinstance(exercise, Artefact):
+    """A cell that takes a function of the checks' module; of what is judged by a file or by training, the reference."""
+    if not isinstance(exercise, Exercise):
         return inspect.getsource(exercise.reference)
     return f"from autograder.checks.{CHAPTER} import EXERCISES\n{exercise.name} = {which.format(e=f'EXERCISES[{number}]')}"
 

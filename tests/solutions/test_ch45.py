@@ -22,6 +22,7 @@ from solutions.ch45 import (
     minibatches,
     ppo_loss,
     ppo_update,
+    torch_ppo_steps,
     train_ppo,
 )
 
@@ -217,6 +218,18 @@ def test_the_fast_update_is_the_plain_one(discrete, changes, steps):
         torch.testing.assert_close(fast.weights.grad, plain.weights.grad, rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(fast.weights, plain.weights, rtol=1e-4, atol=1e-5)
     assert optimizers[0].steps == optimizers[1].steps == steps
+
+
+def test_steps_with_torchs_own_are_those_of_the_update():
+    policy = make_policy(3, 2, hidden=8, log_std=-0.3, seed=1)
+    batch, settings = random_batch(policy), PPOSettings(num_epochs=5, minibatch_size=10_000, learning_rate=1e-2)
+    before = policy.weights.detach().clone()
+    losses, weights = torch_ppo_steps(policy.tensors(), batch, settings, num_steps=5)
+    assert torch.equal(policy.weights, before) and losses.shape == (5,)
+    metrics = ppo_update(policy, Adam(1e-2), batch, settings, seeded())
+    torch.testing.assert_close(weights, policy.tensors(), rtol=1e-4, atol=1e-5)
+    total = metrics["policy_loss"] + 0.5 * metrics["value_loss"] - 0.01 * metrics["entropy"]
+    torch.testing.assert_close(losses.mean(), total, rtol=1e-4, atol=1e-5)
 
 
 SMALL = PPOSettings(total_steps=1024, num_steps=32, minibatch_size=64, learning_rate=3e-3, gamma=0.9, gae_lambda=0.9, hidden=16)

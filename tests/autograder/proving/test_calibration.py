@@ -5,12 +5,14 @@ import pytest
 
 from autograder import checks
 from autograder.authoring import artefacts
-from autograder.authoring.spec import Artefact
+from autograder.authoring.spec import Artefact, Tuning
 from autograder.grading import flights
 from autograder.proving import calibration
+from course_lib.control import tuning
 from course_lib.figures import records
 
 ARTEFACTS = [exercise for exercise in checks.all_exercises() if isinstance(exercise, Artefact)]
+TUNINGS = [exercise for exercise in checks.all_exercises() if isinstance(exercise, Tuning)]
 
 
 def agents(centre, between, within, count=20, seed=0):
@@ -96,7 +98,7 @@ def test_agents_that_miss_the_bar_are_told(agents, told):
         assert lines[0].startswith(told[0])
 
 
-@pytest.mark.parametrize("artefact", ARTEFACTS, ids=lambda artefact: artefact.name)
+@pytest.mark.parametrize("artefact", ARTEFACTS + TUNINGS, ids=lambda artefact: artefact.name)
 def test_a_right_agent_earns_all_points_and_a_wrong_one_not_half_of_them(artefact):
     rows = {row.variant: row for row in calibration.rows(artefact, calibration.groups(artefact))}
     right, wrong = rows[artefact.right], [rows[variant] for variant in artefact.wrong]
@@ -112,4 +114,16 @@ def test_the_judge_flies_a_policy_as_its_run_was_evaluated(artefact):
     judged = flights.fly(artefacts.hidden(artefact), known.artefact(artefact.right, seed, "safetensors").read_bytes(), 120)
     recorded = known.summary(artefact.right, "eval_returns")[0]
     error = np.hypot(judged.std(), recorded.std()) / np.sqrt(len(judged))
+    assert abs(judged.mean() - recorded.mean()) < 4 * error
+
+
+@pytest.mark.parametrize("exercise", TUNINGS, ids=lambda exercise: exercise.name)
+def test_the_judge_trains_as_was_recorded(exercise):
+    frozen, recorded = (
+        artefacts.trained_by_grader(exercise),
+        records.load(exercise.experiment).summary(exercise.right, "eval_returns"),
+    )
+    assert len(frozen.seeds) == recorded.shape[1]
+    judged, _ = tuning.trainings(exercise.train, tuning.tuned(exercise.reference()), frozen.seeds)
+    error = np.hypot(judged.std(ddof=1), recorded.std(ddof=1)) / np.sqrt(len(judged))
     assert abs(judged.mean() - recorded.mean()) < 4 * error

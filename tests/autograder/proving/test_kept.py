@@ -8,7 +8,7 @@ import pytest
 
 from autograder import checks
 from autograder.authoring import chapter
-from autograder.authoring.spec import Artefact
+from autograder.authoring.spec import Artefact, Tuning
 from autograder.paths import ROOT
 from autograder.proving import kept
 from autograder.proving.killmatrix import SEEDS
@@ -34,7 +34,7 @@ def test_a_record_says_that_everything_was_rejected_named_and_accepted(assignmen
     assert list(records) == list(exercises)
     for name, record in records.items():
         exercise, rows = exercises[name], record.rows
-        if isinstance(exercise, Artefact):
+        if isinstance(exercise, Artefact | Tuning):
             assert rows["agents"] and rows["thresholds"] == list(exercise.thresholds)
             continue
         assert rows["seeds"] == SEEDS
