@@ -55,7 +55,8 @@ def _check_function(name: str, function: Callable) -> CheckResult:
 def _called(name: str, function: Callable) -> list[Finding]:
     """What the checks say of the other exercises that a function calls, itself or through others of the notebook."""
     namespace = getattr(function, "__globals__", {})
-    known = {other for other in exercise_names() if other != name and not is_judged_by_file(other)}
+    known = {other for other in exercise_names() if other != name}
+    known -= {other for other in known if is_judged_by_file(other) or is_judged_by_training(other)}
     called = {other: namespace.get(other) for other in used_by(function, namespace) if other in known}
     return [examine(visible_cases(other), one) for other, one in called.items() if callable(one)]
 

@@ -50,7 +50,9 @@ def begin_with(finding: Finding, others: Iterable[Finding]) -> Finding:
     names = [one.exercise for one in others if one.state != "correct" and one.exercise != finding.exercise]
     if finding.state == "correct" or not names:
         return finding
-    rest = "which does not pass its own check: begin there" if len(names) == 1 else "which do not pass their own checks: begin there"
+    rest = (
+        "which does not pass its own check: begin there" if len(names) == 1 else "which do not pass their own checks: begin there"
+    )
     return replace(finding, message=f"It calls {' and '.join(names)}, {rest}.\n{finding.message}")
 
 
