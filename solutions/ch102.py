@@ -95,8 +95,9 @@ def gae_as(
     - "textbook": as compute_gae of chapter 44. δ_t is r_t + γ V(s_{t+1}) - V(s_t), without the
       second term where the task ended; c_t is 0 where it ended or was cut, else 1.
     - "termination": a time limit counts as an end of the task.
-    - "leak": a time limit is not seen. The value in row t + 1, of whatever episode, stands in
-      for that of the successor, and the sum runs on into that row.
+    - "leak": a time limit is not seen. The value in row t + 1, of whatever episode, or
+      last_values after the last row, stands in for that of the successor, and the sum runs on
+      into that row.
     - "current_value": γ V(s_t), of the observation before the step, is added to the reward of
       each truncated step, even if the task ended just then; after that, every end counts as
       an end of the task.
