@@ -1216,7 +1216,7 @@ _WRONG_PARTINGS = {
         "A 1 that tells some two of the rules apart still leaves others alike: every pair must differ.",
     ),
     "neighbours-only": (
-        _parting(parts=lambda gaps: gaps.diagonal(-1).gt(1e-3).all(-1)),
+        _parting(parts=lambda gaps: torch.stack([gap[k] > 1e-3 for k, gap in enumerate(gaps[1:])]).all(0)),
         "Each rule is compared with the next one in the list only; the first and the third may agree.",
     ),
     "the-first-against-the-rest": (
