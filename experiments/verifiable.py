@@ -36,6 +36,7 @@ VARIANTS: dict[str, dict] = {
     "rejection": COMMON | {"method": "rejection"},
     "lab_suspect": MIXED | {"price": PRICE},
     "lab_repaired": MIXED | {"price": PRICE, "scale": "none"},
+    "lab_batch": MIXED | {"price": PRICE, "scale": "batch"},
     "strong": COMMON | {"warm_up": STRONG},
     "hole": COMMON | {"verifier": "ascending"},
     **{f"group_{size}": COMMON | {"prompts": 192 // size, "group_size": size} for size in (2, 4, 16, 32)},

@@ -141,8 +141,9 @@ def kl_term(logps, ref_logps, estimator="k3"):
         k1 = x,   k2 = x² / 2,   k3 = e^(-x) - 1 + x,   x = logps - ref_logps
 
     For tokens drawn from the policy, the mean of k1 and k3 is KL(π ‖ π_ref). As a term of
-    the loss what counts is its gradient, for which the draws are data: in expectation 0 for
-    k1, that of KL(π ‖ π_ref) for k2, and that of KL(π_ref ‖ π) for k3.
+    the loss what counts is its gradient, for which the draws are data: in expectation, at a
+    given beginning of the answer, 0 for k1, that of KL(π ‖ π_ref) for k2, and that of
+    KL(π_ref ‖ π) for k3.
     Schulman (2020), http://joschu.net/blog/kl-approx.html
 
     Args:

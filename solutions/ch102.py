@@ -95,8 +95,9 @@ def gae_as(
     - "textbook": as compute_gae of chapter 44. δ_t is r_t + γ V(s_{t+1}) - V(s_t), without the
       second term where the task ended; c_t is 0 where it ended or was cut, else 1.
     - "termination": a time limit counts as an end of the task.
-    - "leak": a time limit is not seen. The value in row t + 1, of whatever episode, stands in
-      for that of the successor, and the sum runs on into that row.
+    - "leak": a time limit is not seen. The value in row t + 1, of whatever episode, or
+      last_values after the last row, stands in for that of the successor, and the sum runs on
+      into that row.
     - "current_value": γ V(s_t), of the observation before the step, is added to the reward of
       each truncated step, even if the task ended just then; after that, every end counts as
       an end of the task.
@@ -152,6 +153,51 @@ def gae_as(
         targets = torch.cat([(values + advantages)[1:], last_values[None]])
         advantages = (rewards + gamma * targets * ~terminated - values) * ~truncated
     return advantages.detach()
+
+
+def parting_ones(rules, terminated, truncated, gamma=0.99, gae_lambda=0.95):
+    """Which inputs tell rules of gae_as apart, where one number is 1 and all others 0.
+
+        parts = all_{i<j} (max |A_i - A_j| > 1e-3),   A_i by rules[i], over all steps
+
+    The flags are given; free are the reward and the value of each row, the value of the true
+    successor where an episode ends, and last_values. Where none ends, next_values continues
+    values, and last_values after the last row: such a 1 stands in both.
+
+    Args:
+      rules: two names or more that gae_as takes.
+      terminated: True where the task itself ended; (T, N) bool.
+      truncated: True where a time limit cut the episode; (T, N) bool.
+      gamma: discount per step, in [0, 1].
+      gae_lambda: λ in [0, 1].
+
+    Returns: dict of bool tensors, True where a 1 in this place tells every two of the rules
+      apart: rewards, values and next_values, (T, N), the last False where no episode ends;
+      and last_values, (N,).
+    Raises: ValueError that names an argument if rules are fewer than two, or as gae_as.
+    """
+    if len(rules) < 2:
+        raise ValueError(f"rules must be two at least, got {len(rules)}")
+    validate.same_shape(terminated=terminated, truncated=truncated)
+    steps, envs = terminated.shape
+    sizes = [steps * envs] * 3 + [envs]
+    probes = sum(sizes)  # as further environments, side by side
+
+    def beside(flags):
+        return flags[..., None].expand(steps, envs, probes).reshape(steps, -1)
+
+    rewards, values, finals, last = torch.eye(probes).split(sizes)
+    rewards, values, finals = (x.reshape(steps, -1) for x in (rewards, values, finals))
+    last, ends = last.reshape(-1), (beside(terminated), beside(truncated))
+    next_values = torch.where(ends[0] | ends[1], finals, torch.cat([values[1:], last[None]]))
+    rollout = (rewards, values, next_values, last, *ends, gamma, gae_lambda)
+    found = torch.stack([gae_as(rule, *rollout) for rule in rules])
+    pairs = [(i, j) for j in range(len(rules)) for i in range(j)]
+    gaps = torch.stack([(found[i] - found[j]).abs().amax(0) for i, j in pairs])
+    parts = (gaps > 1e-3).reshape(len(pairs), envs, probes).any(1).all(0)
+    rewards, values, finals, last = parts.split(sizes)
+    told = {"rewards": rewards, "values": values, "next_values": finals}
+    return {name: x.reshape(steps, envs) for name, x in told.items()} | {"last_values": last}
 
 
 def which_gae(

@@ -15,6 +15,7 @@ from autograder.authoring.parts import (
     after,
     bad_input_accepted,
     drawing,
+    drawn_once,
     dtype_lost,
     in_place,
     integers,
@@ -1113,6 +1114,212 @@ WHICH_GAE = Exercise(
     },
 )
 
+# ---------------------------------------------------------------------------------------------------------- parting_ones
+
+
+@drawing
+def _ends_only(generator, rules, cut=("truncated",), steps=4, envs=1, env=0, at=None, rate=0.0, **scalars):
+    """Flags alone, and the rules to be told apart; `cut` names the flags of the step that ends an episode."""
+    flags = {name: torch.rand(steps, envs, generator=generator) < rate for name in ("terminated", "truncated")}
+    step = int(integers(generator, 1, steps - 1)) if at is None else at
+    for name in cut:
+        flags[name][step, env] = True
+    drawn = 0.8 + 0.15 * uniform(generator, 2)
+    return {"rules": list(rules), **flags, **dict(zip(("gamma", "gae_lambda"), drawn.tolist(), strict=True)), **scalars}
+
+
+def _continued(values, finals, last, ended):
+    """What follows each step: the next row, last_values after the last one, and the true successor where an episode ends."""
+    return torch.where(ended, finals, torch.cat([values[1:], last[None]]))
+
+
+def _every_two(gaps):
+    return gaps[torch.ones(gaps.shape[:2], dtype=torch.bool).tril(-1)].gt(1e-3).all(0)
+
+
+def _largest(difference, _truncated):
+    return difference.abs().amax((0, 1))
+
+
+def _parting(follow=_continued, parts=_every_two, gap=_largest, known=RULES):
+    """A version of the search: what stands in next_values, which of the gaps (rules, rules, probes) must be large, and how the gap of two
+    rules (T, N, probes) is measured."""
+
+    def search(rules, terminated, truncated, gamma, gae_lambda):
+        if any(rule not in known for rule in rules):
+            raise ValueError(f"rules: {rules} are not all of the five")
+        steps, envs = terminated.shape
+        sizes = [steps * envs] * 3 + [envs]
+        rewards, values, finals, last = torch.eye(sum(sizes), dtype=torch.float64).split(sizes)
+        shaped = [x.reshape(steps, -1) for x in (rewards, values, finals)]
+        flags = [x.repeat_interleave(sum(sizes), 1) for x in (terminated, truncated)]
+        following = follow(shaped[1], shaped[2], last.flatten(), flags[0] | flags[1])
+        x = _Rollout(shaped[0], shaped[1], following, last.flatten(), *flags, gamma, gae_lambda)
+        made = [_BY_RULE.get(rule, _textbook)(x).reshape(steps, envs, -1) for rule in rules]
+        gaps = torch.stack([torch.stack([gap(one - other, truncated) for other in made]) for one in made])
+        told = parts(gaps).split(sizes)
+        names = (*FLOATS, "last_values")
+        return {name: y if name == "last_values" else y.reshape(steps, envs) for name, y in zip(names, told, strict=True)}
+
+    return search
+
+
+def _parting_by_hand(rules, terminated, truncated, gamma, gae_lambda):
+    """One rollout after another, one pair of rules after another."""
+    steps, envs = terminated.shape
+    out = {name: torch.zeros(steps, envs, dtype=torch.bool) for name in FLOATS} | {
+        "last_values": torch.zeros(envs, dtype=torch.bool)
+    }
+    ended = terminated | truncated
+    for name, told in out.items():
+        for place in torch.ones(told.shape).nonzero().tolist():
+            given = {part: torch.zeros(found.shape, dtype=torch.float64) for part, found in out.items()}
+            if name == "next_values" and not ended[tuple(place)]:
+                continue
+            given[name][tuple(place)] = 1.0
+            for t in range(steps):
+                for env in range(envs):
+                    if not ended[t, env]:
+                        after = given["values"][t + 1, env] if t + 1 < steps else given["last_values"][env]
+                        given["next_values"][t, env] = after
+            x = _Rollout(*given.values(), terminated, truncated, gamma, gae_lambda)
+            made = [_BY_RULE[rule](x) for rule in rules]
+            pairs = ((one, other) for k, one in enumerate(made) for other in made[:k])
+            told[tuple(place)] = all((one - other).abs().max() > 1e-3 for one, other in pairs)
+    return out
+
+
+def _parting_by_pairs(rules, *given):
+    """Two rules at a time: what parts all is in every answer."""
+    pairs = [(one, other) for k, one in enumerate(rules) for other in rules[:k]]
+    found = [ch102.parting_ones(pair, *given) for pair in pairs]
+    return {name: torch.stack([told[name] for told in found]).all(0) for name in found[0]}
+
+
+def _knowing_all(search):
+    """The same with the names checked first."""
+
+    def checked(rules, *given):
+        if set(rules) - set(RULES):
+            raise ValueError(f"rules: {rules} are not all of the five")
+        return search(rules, *given)
+
+    return checked
+
+
+_two_rules = satisfies(lambda rules: len(rules) > 1)
+_parts = versions_of(ch102.parting_ones, _two_rules, one_shape("terminated", "truncated"), _GAMMA, _LAMBDA)
+
+_WRONG_PARTINGS = {
+    "one-pair-is-enough": (
+        _parting(parts=lambda gaps: (gaps > 1e-3).any(0).any(0)),
+        "A 1 that tells some two of the rules apart still leaves others alike: every pair must differ.",
+    ),
+    "neighbours-only": (
+        _parting(parts=lambda gaps: torch.stack([gap[k] > 1e-3 for k, gap in enumerate(gaps[1:])]).all(0)),
+        "Each rule is compared with the next one in the list only; the first and the third may agree.",
+    ),
+    "the-first-against-the-rest": (
+        _parting(parts=lambda gaps: gaps[1:, 0].gt(1e-3).all(0)),
+        "All are compared with the first rule only: among the others, two may agree.",
+    ),
+    "distance-without-abs": (
+        _parting(gap=lambda difference, _truncated: difference.amax((0, 1))),
+        "A rule whose advantages are smaller differs, too: take the absolute value of the difference.",
+    ),
+    "any-difference-counts": (
+        _parting(parts=lambda gaps: gaps[torch.ones(gaps.shape[:2], dtype=torch.bool).tril(-1)].gt(0).all(0)),
+        "A difference below 1e-3 is not seen in a log that is rounded: compare with 1e-3, not with 0.",
+    ),
+    "the-cut-step-only": (
+        _parting(gap=lambda difference, truncated: (difference.abs() * truncated[..., None]).amax((0, 1))),
+        "Only truncated steps are looked at: rules may differ at any step of the rollout.",
+    ),
+    "first-environment-only": (
+        _parting(gap=lambda difference, _truncated: difference[:, 0].abs().amax(0)),
+        "Only the first environment is looked at: the end may be in another one.",
+    ),
+    "no-successor-follows": (
+        _parting(lambda values, finals, last, ended: finals * ended),
+        "No rollout looks like this: where no episode ends, next_values holds the next row's value, and a 1 in values stands there, too.",
+    ),
+    "last-values-stand-alone": (
+        _parting(lambda values, finals, last, ended: torch.where(ended, finals, torch.cat([values[1:], 0 * last[None]]))),
+        "After the last row next_values holds last_values, unless an episode ends there: the 1 must stand in both.",
+    ),
+    "the-next-episode-follows": (
+        _parting(lambda values, finals, last, ended: torch.cat([values[1:], last[None]]) + finals * ended),
+        "Where an episode ends, row t + 1 belongs to another one: its value is not that of the successor.",
+    ),
+    "successors-everywhere": (
+        _parting(lambda values, finals, last, ended: torch.cat([values[1:], last[None]]) * ~ended + finals),
+        "Where no episode ends, next_values is not free: it holds what values holds in the next row. Leave these places False.",
+    ),
+}
+
+
+PARTING_ONES = Exercise(
+    name="parting_ones",
+    reference=ch102.parting_ones,
+    criteria={"values": 1.6, "inputs": 0.1, "errors": 0.3},
+    axes=("t", "env"),
+    cases=drawn_once(
+        Case("termination and leak", _ends_only(("termination", "leak")), closed_form=_parting_by_hand, visible=True),
+        Case("termination and textbook", _ends_only(("termination", "textbook")), visible=True),
+        Case("textbook and termination", _ends_only(("textbook", "termination")), visible=True),
+        Case("leak, current_value and dropped", _ends_only(("leak", "current_value", "dropped")), visible=True),
+        Case("leak, dropped and textbook", _ends_only(("leak", "dropped", "textbook")), visible=True),
+        Case("current_value, leak and termination", _ends_only(("current_value", "leak", "termination")), visible=True),
+        Case("textbook, leak and termination", _ends_only(("textbook", "leak", "termination")), visible=True),
+        Case("all five", _ends_only(RULES), visible=True),
+        Case("no episode ends: textbook and leak", _ends_only(("textbook", "leak"), ()), visible=True),
+        Case("no episode ends: dropped and textbook", _ends_only(("dropped", "textbook"), ()), visible=True),
+        Case("both in the same step", _ends_only(("current_value", "termination"), ("terminated", "truncated")), visible=True),
+        Case("the task ended", _ends_only(("dropped", "leak"), ("terminated",)), visible=True),
+        Case("a time limit in the second environment", _ends_only(("termination", "leak"), envs=2, env=1), visible=True),
+        Case("a time limit in the last row", _ends_only(("leak", "textbook"), at=3), visible=True),
+        Case(
+            "γ λ is small: differences fade",
+            _ends_only(("leak", "termination"), steps=7, at=1, gamma=0.6, gae_lambda=0.2),
+            visible=True,
+        ),
+        Case(
+            "many ends",
+            _ends_only(("dropped", "leak", "current_value"), steps=5, envs=2, rate=0.3),
+            closed_form=_parting_by_hand,
+            draws=2,
+        ),
+        Case("default gamma and gae_lambda", without(_ends_only(("leak", "current_value")), "gamma", "gae_lambda")),
+        Case("gamma = 0", _ends_only(("leak", "dropped"), gamma=0.0)),
+        Case("gae_lambda = 0", _ends_only(("leak", "termination"), gae_lambda=0.0)),
+        Case("one rule", _ends_only(("leak",)), raises=["rules"], visible=True),
+        Case("leak and truncation", _ends_only(("leak", "truncation")), raises=["rule"], visible=True),
+        refused(_ends_only(("leak", "textbook")), gamma=1.5, visible=True),
+        refused(_ends_only(("leak", "textbook")), gae_lambda=-0.1),
+        Case(
+            "truncated with a step too few",
+            reshaped(_ends_only(("leak", "textbook")), "truncated", lambda x: x[1:]),
+            raises=("terminated", "truncated"),
+            visible=True,
+        ),
+    ),
+    misconceptions=(
+        *wrong(_WRONG_PARTINGS, _parts),
+        Misconception(
+            "says-which-not",
+            _parts(lambda *given: {name: ~told for name, told in _parting()(*given).items()}),
+            "True where a 1 tells the rules apart; this is True where it does not.",
+        ),
+        in_place(ch102.parting_ones, "truncated", 2),
+        bad_input_accepted(_parts(_parting(known=_Anything()), checked=False)),
+    ),
+    variants={
+        "one rollout after another": _parts(_knowing_all(_parting_by_hand)),
+        "all gaps in one table": _parts(_parting()),
+        "two rules at a time": _parts(_knowing_all(_parting_by_pairs)),
+    },
+)
+
 # ---------------------------------------------------------------------------------------------------- repaired_bootstrap
 
 _STORED = ("stored_rewards", "values", "next_values")
@@ -1283,4 +1490,4 @@ REPAIRED_BOOTSTRAP = Exercise(
     },
 )
 
-EXERCISES = (CLIP_FRACTION_AS, WHICH_DIAGNOSTICS, GAE_AS, WHICH_GAE, REPAIRED_BOOTSTRAP)
+EXERCISES = (CLIP_FRACTION_AS, WHICH_DIAGNOSTICS, GAE_AS, WHICH_GAE, PARTING_ONES, REPAIRED_BOOTSTRAP)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from solutions.ch44 import compute_gae
-from solutions.ch102 import clip_fraction_as, gae_as, repaired_bootstrap, which_diagnostics, which_gae
+from solutions.ch102 import clip_fraction_as, gae_as, parting_ones, repaired_bootstrap, which_diagnostics, which_gae
 
 INF = math.inf
 
@@ -120,6 +120,32 @@ def test_advantages_of_a_log_tell_which_rules_can_have_made_them():
         logged = gae_as("leak", **given).float().double()
         assert {rule for rule, fits in zip(RULES, which_gae(logged, RULES, **given), strict=True) if fits} == expected
         assert not which_gae(logged + 0.01, RULES, **given).any()
+
+
+@pytest.mark.parametrize(
+    ("rules", "expected"),
+    [
+        (["textbook", "termination"], {"next_values": [0, 1, 0]}),
+        (["leak", "termination"], {"rewards": [0, 0, 1], "values": [0, 0, 1], "last_values": [1]}),
+        (["current_value", "termination"], {"values": [0, 1, 0]}),
+        (["leak", "current_value", "dropped"], {"values": [0, 1, 0]}),
+        (RULES, {}),
+    ],
+)
+def test_a_single_one_parts_rules_where_they_read_another_number(rules, expected):
+    found = parting_ones(rules, NO, flags(0, 1, 0), **HALF)
+    assert {name: told.int().flatten().tolist() for name, told in found.items() if told.any()} == expected
+
+
+def test_what_no_rollout_can_hold_parts_nothing():
+    found = parting_ones(["textbook", "leak"], NO, NO)  # both read the same successor where no episode ends
+    assert not any(told.any() for told in found.values())
+    assert [tuple(told.shape) for told in found.values()] == [(3, 1)] * 3 + [(1,)]
+
+
+def test_one_rule_has_nothing_to_be_told_from():
+    with pytest.raises(ValueError, match="rules must be two"):
+        parting_ones(["leak"], NO, NO)
 
 
 @pytest.mark.parametrize("rule", ["truncation", "", None])
