@@ -1154,7 +1154,7 @@ def _parting(follow=_continued, parts=_every_two, gap=_largest, known=RULES):
         shaped = [x.reshape(steps, -1) for x in (rewards, values, finals)]
         flags = [x.repeat_interleave(sum(sizes), 1) for x in (terminated, truncated)]
         following = follow(shaped[1], shaped[2], last.flatten(), flags[0] | flags[1])
-        x = _Rollout(shaped[0], shaped[1], following, last.flatten(), *flags, gamma, gae_lambda)
+        x = _Rollout(shaped[0], shaped[1], following, last.flatten(), *flags, gamma, gae_lambda)  # type: ignore[call-arg]
         made = [_BY_RULE.get(rule, _textbook)(x).reshape(steps, envs, -1) for rule in rules]
         gaps = torch.stack([torch.stack([gap(one - other, truncated) for other in made]) for one in made])
         told = parts(gaps).split(sizes)
@@ -1182,7 +1182,7 @@ def _parting_by_hand(rules, terminated, truncated, gamma, gae_lambda):
                     if not ended[t, env]:
                         after = given["values"][t + 1, env] if t + 1 < steps else given["last_values"][env]
                         given["next_values"][t, env] = after
-            x = _Rollout(*given.values(), terminated, truncated, gamma, gae_lambda)
+            x = _Rollout(*given.values(), terminated, truncated, gamma, gae_lambda)  # type: ignore[call-arg, arg-type]
             made = [_BY_RULE[rule](x) for rule in rules]
             pairs = ((one, other) for k, one in enumerate(made) for other in made[:k])
             told[tuple(place)] = all((one - other).abs().max() > 1e-3 for one, other in pairs)
