@@ -92,7 +92,7 @@ def _geometric(rewards, alpha, gamma, num_sweeps, **_rest):
 
 
 @drawing
-def _two_best(generator, actions=3, alpha=1e-6, gamma=0.9, num_sweeps=50):
+def _two_best(generator, actions=3, alpha=1e-6, gamma=0.9, num_sweeps=5):
     """One state that leads to itself, of whose actions the first two are equally good and the best by far."""
     rewards = uniform(generator, 1, actions) - 3
     rewards[:, :2] = 1 + uniform(generator, 1)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+
 import numpy as np
 import torch
 
@@ -468,7 +471,7 @@ def _between(s, r, k, threshold):
     return s[k - 1] + (threshold - r[k - 1]) / (r[k] - r[k - 1]) * (s[k] - s[k - 1])
 
 
-def _crossing(k, s, r, threshold, never=np.inf):
+def _crossing(k, s, r, threshold, never=math.inf):
     return never if k is None else s[0] if k == 0 else _between(s, r, k, threshold)
 
 
@@ -478,12 +481,12 @@ def _right(s, r, threshold, **given):
 
 def _at_evaluation(s, r, threshold):
     k = _first(r, threshold)
-    return np.inf if k is None else s[k]
+    return math.inf if k is None else s[k]
 
 
 def _before_it(s, r, threshold):
     k = _first(r, threshold)
-    return np.inf if k is None else s[max(k - 1, 0)]
+    return math.inf if k is None else s[max(k - 1, 0)]
 
 
 def _for_good(s, r, threshold):
@@ -498,47 +501,43 @@ def _above_only(s, r, threshold):
 
 
 def _at_the_best(s, r, threshold):
-    return s[int(np.argmax(r))] if max(r) >= threshold else np.inf
+    return s[r.index(max(r))] if max(r) >= threshold else math.inf
 
 
 def _nearest(s, r, threshold):
-    return s[int(np.argmin(np.abs(np.array(r) - threshold)))] if max(r) >= threshold else np.inf
+    return min(zip(r, s, strict=True), key=lambda pair: abs(pair[0] - threshold))[1] if max(r) >= threshold else math.inf
 
 
 def _by_running_best(s, r, threshold):
-    return _right(s, np.maximum.accumulate(r).tolist(), threshold)
-
-
-def _by_inverted_interpolation(s, r, threshold):
-    return float(np.interp(threshold, r, s)) if max(r) >= threshold else np.inf
+    return _right(s, list(itertools.accumulate(r, max)), threshold)
 
 
 def _wrapped(s, r, threshold):
     """An index of -1 at the first evaluation."""
     k = _first(r, threshold)
-    return np.inf if k is None else _between(s, r, k, threshold)
+    return math.inf if k is None else _between(s, r, k, threshold)
 
 
 def _from_nothing(s, r, threshold):
     """Every curve begins with a return of 0 at no steps."""
     k = _first(r, threshold)
-    return np.inf if k is None else _between([0.0, *s], [0.0, *r], k + 1, threshold) if r[k] else s[k]
+    return math.inf if k is None else _between([0.0, *s], [0.0, *r], k + 1, threshold) if r[k] else s[k]
 
 
 def _other_share(s, r, threshold):
     k = _first(r, threshold)
-    return np.inf if k is None else s[0] if k == 0 else s[k - 1] + s[k] - _between(s, r, k, threshold)
+    return math.inf if k is None else s[0] if k == 0 else s[k - 1] + s[k] - _between(s, r, k, threshold)
 
 
 def _in_the_middle(s, r, threshold):
     k = _first(r, threshold)
-    return np.inf if k is None else s[0] if k == 0 else 0.5 * (s[k - 1] + s[k])
+    return math.inf if k is None else s[0] if k == 0 else 0.5 * (s[k - 1] + s[k])
 
 
 def _as_weights(s, r, threshold):
     k = _first(r, threshold)
     if not k:
-        return np.inf if k is None else s[0]
+        return math.inf if k is None else s[0]
     after, before = r[k] - threshold, threshold - r[k - 1]
     return (after * s[k - 1] + before * s[k]) / (after + before)
 
@@ -552,8 +551,8 @@ def _all_segments(steps, returns, threshold):
     """A variant: every segment that crosses upwards, and the earliest of them."""
     low, high = returns[:, :-1], returns[:, 1:]
     at = steps[:-1] + (threshold - low) / (high - low) * steps.diff()
-    crossing = torch.where((low < threshold) & (high >= threshold), at, torch.inf)
-    begun = torch.where(returns[:, :1] >= threshold, steps[:1], torch.inf)
+    crossing = torch.where((low < threshold) & (high >= threshold), at, math.inf)
+    begun = torch.where(returns[:, :1] >= threshold, steps[:1], math.inf)
     return torch.cat([begun, crossing], 1).amin(1).to(returns.dtype)
 
 
@@ -565,7 +564,7 @@ def _by_counting(steps, returns, threshold):
         if 0 < k < len(steps):
             found.append(torch.lerp(steps[k - 1], steps[k], ((threshold - run[k - 1]) / (run[k] - run[k - 1])).to(steps.dtype)))
         else:
-            found.append(steps[0] if k == 0 else torch.tensor(torch.inf))
+            found.append(steps[0] if k == 0 else torch.tensor(math.inf))
     return torch.stack([one.to(returns.dtype) for one in found])
 
 
@@ -598,7 +597,7 @@ _WRONG_STEPS_TO_THRESHOLD = {
         " infinity.",
     ),
     "never-is-nan": (
-        lambda *given: _right(*given, never=np.nan),
+        lambda *given: _right(*given, never=math.nan),
         "A run that never reaches the threshold is not unknown: it is later than all others. Infinity can be sorted, nan cannot.",
     ),
     "never-is-minus-one": (
@@ -618,10 +617,6 @@ _WRONG_STEPS_TO_THRESHOLD = {
     "running-best": (
         _by_running_best,
         "The line is drawn from the best return so far. It goes from the evaluation before, which may be lower.",
-    ),
-    "interpolated-from-returns-to-steps": (
-        _by_inverted_interpolation,
-        "interp needs positions that increase, and returns do not: between the two evaluations of the first crossing they do.",
     ),
     "before-the-first-wraps": (
         _wrapped,
@@ -645,7 +640,7 @@ STEPS_TO_THRESHOLD = Exercise(
         Case("runs that dip and wander", _curves("dips before", "wanders", "late"), visible=True, draws=2),
         Case("one that loses it again", _curves("loses it", "climbs"), visible=True),
         Case("one that never does", _curves("climbs", "never", "late"), visible=True),
-        Case("none ever does", _curves("never", "never"), closed_form=number(np.inf, np.inf)),
+        Case("none ever does", _curves("never", "never"), closed_form=number(math.inf, math.inf)),
         Case("one that begins above", _curves("begins above", "wanders"), visible=True),
         Case("one that touches", _curves("touches", "never"), visible=True, draws=2),
         Case("all kinds, in seconds", _curves(*RUNS, unit=7.0), draws=2),
