@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from functools import partial
 from types import SimpleNamespace
+from typing import Any
 
 import torch
 from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
@@ -183,7 +184,7 @@ def _one_short(rewards, transitions, alpha, gamma, num_sweeps):
         return q, values, (q / alpha).softmax(-1)
 
 
-_WRONG_SOFT_VALUE_ITERATION = {
+_WRONG_SOFT_VALUE_ITERATION: dict[str, tuple[dict[str, Any], str]] = {
     "hard-maximum": (
         {"value": lambda q, alpha: q.amax(-1)},
         "The value is that of the best action, as in ordinary value iteration. A soft value is α log Σ exp(Q/α): it lies above the"
