@@ -17,11 +17,11 @@ def soft_value_iteration(rewards, transitions, alpha, gamma=0.95, num_sweeps=300
     """The best soft policy of a small problem whose rules are known, and its values.
 
         Q ← r + γ Σ_s' P(s'|s, a) V(s'),   V ← α log Σ_a exp(Q / α),   from V = 0
-        π = exp((Q - V) / α)
+        π = softmax(Q / α)
 
     Haarnoja et al. (2017), section 3.1, https://arxiv.org/abs/1702.08165. Q / α exceeds
-    what an exponential can hold long before α is small: for α = 10⁻⁶, too, the result is
-    right and finite, and then it is that of ordinary value iteration.
+    what an exponential can hold long before α is small: for α = 10⁻⁶, too, and in single
+    precision, the result is right and finite, and then it is that of ordinary value iteration.
 
     Args:
       rewards: r(s, a); (S, A).
@@ -224,7 +224,8 @@ def sac_update(agent, batch, next_noise, noise, settings):
       settings: SACSettings; gamma and tau are what counts here.
 
     Returns: dictionary of critic_loss, actor_loss, temperature_loss and entropy (the mean of
-      -log π(ã|s), nats): 0-dim tensors without a graph, each as it was when it was computed.
+      -log π(ã|s), nats), these four and no other: 0-dim tensors without a graph, each as it
+      was when it was computed.
     """
 
     def drawn(obs, noise):

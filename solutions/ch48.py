@@ -66,6 +66,44 @@ def bootstrap_interval(scores, confidence=0.95, num_resamples=2000, generator=No
     return means.quantile(tail), means.quantile(1 - tail)
 
 
+def steps_to_threshold(steps, returns, threshold):
+    """How long each run took until its curve first reached a return, and infinity where it
+    never did.
+
+        s_{k-1} + (θ - R_{k-1}) / (R_k - R_{k-1}) (s_k - s_{k-1}),   k = the first with R_k ≥ θ
+
+    A curve goes straight from one evaluation to the next. One that begins at the threshold or
+    above has reached it at its first evaluation. A run that never does is not left out: it is
+    censored, and would have taken longer than anybody waited.
+
+    Taylor & Stone (2009), "time to threshold", https://www.jmlr.org/papers/v10/taylor09a.html
+
+    Args:
+      steps: s, where all runs were evaluated, in environment steps or in seconds; increasing;
+        (T,).
+      returns: R, what each of N runs earned there; (N, T).
+      threshold: θ, in units of return; a number.
+
+    Returns: (N,), in the units of steps and the dtype of returns.
+    Raises: ValueError that names an argument if returns is not (N, T) for steps (T,), or if
+      steps do not increase.
+    """
+    if returns.shape[1:] != steps.shape or steps.dim() != 1:
+        raise ValueError(
+            f"returns must be (N, T) for steps (T,), got {tuple(returns.shape)} for "
+            f"{tuple(steps.shape)}"
+        )
+    if not (steps.diff() > 0).all():
+        raise ValueError("steps must increase from one evaluation to the next")
+    reached = returns >= threshold
+    first = reached.int().argmax(1)  # 0 where it never is
+    before = (first - 1).clamp_min(0)
+    low, high = (returns.gather(1, at[:, None])[:, 0] for at in (before, first))
+    share = torch.where(first > 0, (threshold - low) / (high - low), 0.0)
+    crossed = steps[before] + share * (steps[first] - steps[before])
+    return torch.where(reached.any(1), crossed, math.inf).to(returns.dtype)
+
+
 def repaired_transitions(obs, sent, rewards, next_obs, terminated, truncated, low, high):
     """What the suspect program of the bug lab should have put into its replay buffer.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from functools import partial
 from types import SimpleNamespace
+from typing import Any
 
 import torch
 from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
@@ -91,6 +92,15 @@ def _geometric(rewards, alpha, gamma, num_sweeps, **_rest):
     return rewards + gamma * before, now[None], (rewards / alpha).softmax(-1)
 
 
+@drawing
+def _two_best(generator, actions=3, alpha=1e-6, gamma=0.9, num_sweeps=5):
+    """One state that leads to itself, of whose actions the first two are equally good and the best by far."""
+    rewards = uniform(generator, 1, actions) - 3
+    rewards[:, :2] = 1 + uniform(generator, 1)
+    transitions = torch.ones(1, actions, 1, dtype=torch.float64)
+    return {"rewards": rewards, "transitions": transitions, "alpha": alpha, "gamma": gamma, "num_sweeps": num_sweeps}
+
+
 def _shapes_fit(rewards, transitions):
     return transitions.shape == (*rewards.shape, rewards.shape[0])
 
@@ -159,7 +169,22 @@ def _entropy_added(q, alpha):
     return (log_policy.exp() * (q - alpha * log_policy)).sum(-1)
 
 
-_WRONG_SOFT_VALUE_ITERATION = {
+def _by_difference(value):
+    """The policy by its formula exp((Q - V) / α): a wrong V passes its fault on, and a right one the rounding of a difference."""
+    return lambda q, alpha: ((q - value(q, alpha)[:, None]) / alpha).exp()
+
+
+def _one_short(rewards, transitions, alpha, gamma, num_sweeps):
+    """The loop ends one sweep early, so that after one that is asked for there is no Q."""
+    values = torch.zeros_like(rewards[:, 0])
+    with torch.no_grad():
+        for _ in range(num_sweeps - 1):
+            q = _backed_up(rewards, transitions, values, gamma)
+            values = _soft_maximum(q, alpha)
+        return q, values, (q / alpha).softmax(-1)
+
+
+_WRONG_SOFT_VALUE_ITERATION: dict[str, tuple[dict[str, Any], str]] = {
     "hard-maximum": (
         {"value": lambda q, alpha: q.amax(-1)},
         "The value is that of the best action, as in ordinary value iteration. A soft value is α log Σ exp(Q/α): it lies above the"
@@ -215,6 +240,7 @@ _WRONG_SOFT_VALUE_ITERATION = {
         " follows: take them as they are.",
     ),
     "one-sweep-more": ({"more": 1}, "There is a sweep too many: after one, from V = 0, Q is the reward."),
+    "one-sweep-short-from-zero": ({"more": -1}, "There is a sweep too few: after one, from V = 0, Q is the reward, and not 0."),
     "values-of-the-sweep-before": (
         {"late": 1},
         "The values are those of the sweep before: they are to be the soft maximum of the Q that is returned.",
@@ -227,6 +253,17 @@ _WRONG_SOFT_VALUE_ITERATION = {
         {"data": False},
         "The results carry the graph of all sweeps, which nobody differentiates: compute them under torch.no_grad().",
     ),
+}
+
+_SPREADING = ("hard-maximum", "not-multiplied-by-alpha", "mean-in-place-of-sum")
+"""Mistakes in V that a policy by exp((Q - V) / α) shares."""
+
+_WRONG_WITH_THEIR_POLICY = {
+    f"{name}-and-its-policy": (
+        parts | {"policy": _by_difference(parts["value"])},
+        f"{message} The policy, exp((Q - V) / α), is wrong with it.",
+    )
+    for name, (parts, message) in ((name, _WRONG_SOFT_VALUE_ITERATION[name]) for name in _SPREADING)
 }
 
 _TABLES = ("rewards", "transitions")
@@ -257,6 +294,13 @@ SOFT_VALUE_ITERATION = Exercise(
         Case("default settings", without(_problem(), "gamma", "num_sweeps"), closed_form=_cell_by_cell, visible=True),
         Case("rewards require gradient", _problem(), differentiate=("rewards",), visible=True),
         Case("single precision", _problem(num_sweeps=10), dtype=torch.float32, visible=True),
+        Case(
+            "a cold one in single precision, two equal actions",
+            _two_best(),
+            closed_form=_geometric,
+            dtype=torch.float32,
+            visible=True,
+        ),
         misshapen("transitions without an action", _problem(), "transitions", lambda p: p[:, 1:], raises=_TABLES, draws=1),
         misshapen(
             "one table of transitions for all actions",
@@ -283,7 +327,18 @@ SOFT_VALUE_ITERATION = Exercise(
         refused(_problem(), num_sweeps=0, visible=True),
     ),
     misconceptions=(
-        *wrong(_WRONG_SOFT_VALUE_ITERATION, lambda parts: _sweeping(**parts)),
+        *wrong(_WRONG_SOFT_VALUE_ITERATION | _WRONG_WITH_THEIR_POLICY, lambda parts: _sweeping(**parts)),
+        Misconception(
+            "policy-by-a-difference",
+            _sweeping(policy=_by_difference(_soft_maximum)),
+            "exp((Q - V) / α) is right on paper. In a computer Q - V is rounded, and a small α makes the rounding large: these"
+            " probabilities do not sum to 1. (Q / α).softmax(-1) takes the difference of exponents alone.",
+        ),
+        Misconception(
+            "one-sweep-short",
+            _iterated(_one_short),
+            "There is a sweep too few, and so, where one is asked for, no Q at all: range(num_sweeps) counts num_sweeps of them.",
+        ),
         Misconception(
             "dtype-lost", after(ch47.soft_value_iteration, lambda tables: tuple(table.float() for table in tables)), DTYPE
         ),
@@ -296,7 +351,7 @@ SOFT_VALUE_ITERATION = Exercise(
         "action by action": _sweeping(_by_halves),
         "the largest taken out by hand": _sweeping(_largest_taken_out),
         "mean and wage": _sweeping(_entropy_added),
-        "the policy by Q - V": _sweeping(policy=lambda q, alpha: ((q - _soft_maximum(q, alpha)[:, None]) / alpha).exp()),
+        "the policy by logarithms": _sweeping(policy=lambda q, alpha: (q / alpha).log_softmax(-1).exp()),
     },
 )
 
@@ -1182,7 +1237,7 @@ def _updating(
     follow=_follow,
     order="target critics policy temperature copies",
     acting=_acting,
-    one_noise=False,
+    noises=lambda next_noise, noise: (next_noise, noise),
     told=_told,
 ):
     """A version of the program, from the places where it can go wrong; `order` says what comes when, and `acting` draws all actions."""
@@ -1191,8 +1246,7 @@ def _updating(
 
     def version(agent, batch, next_noise, noise, settings):
         alpha = price(agent)
-        if one_noise:
-            next_noise = noise
+        next_noise, noise = noises(next_noise, noise)
         for part in order.split():
             if part == "target":
                 y = targets(agent, batch, next_noise, alpha, settings.gamma)
@@ -1315,9 +1369,13 @@ _WRONG_SAC_UPDATE = {
         {"targets": lambda agent, batch, noise, alpha, gamma: _targets(agent, batch, noise, alpha, gamma, judged=batch.obs)},
         "The action drawn for next_obs is judged in obs: both belong to the next state.",
     ),
-    "noises-swapped": (
-        {"one_noise": True},
+    "one-noise-for-both": (
+        {"noises": lambda next_noise, noise: (noise, noise)},
         "next_noise is not used: it makes the actions in next_obs, noise those in obs.",
+    ),
+    "noises-swapped": (
+        {"noises": lambda next_noise, noise: (noise, next_noise)},
+        "The two noises have changed places: next_noise makes the actions in next_obs, noise those in obs.",
     ),
     "policy-before-the-critics": (
         {"order": "policy target critics temperature copies"},

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+
 import numpy as np
 import torch
 
 from autograder.authoring.parts import (
     after,
+    altered,
     bad_input_accepted,
     drawing,
     drawn_once,
     dtype_lost,
     in_place,
+    misshapen,
     normal,
+    number,
     one_shape,
     python_float,
     replaced,
@@ -24,7 +30,7 @@ from autograder.authoring.parts import (
     without,
     wrong,
 )
-from autograder.authoring.spec import Case, Exercise
+from autograder.authoring.spec import Case, Exercise, Misconception
 from course_lib.checks.cases import built
 from course_lib.control.replay import Transitions
 from solutions import ch48
@@ -397,6 +403,281 @@ BOOTSTRAP_INTERVAL = Exercise(
     },
 )
 
+# ----------------------------------------------------------------------------------------------------- steps_to_threshold
+
+THRESHOLD = 100.0
+RUNS = {
+    "climbs": (10.0, 40.0, 80.0, 130.0, 160.0, 190.0),
+    "dips before": (20.0, 70.0, 30.0, 120.0, 150.0, 180.0),
+    "wanders": (15.0, 90.0, 140.0, 60.0, 70.0, 150.0),
+    "loses it": (5.0, 50.0, 180.0, 200.0, 90.0, 20.0),
+    "late": (0.0, 5.0, 10.0, 20.0, 60.0, 110.0),
+    "begins above": (120.0, 60.0, 40.0, 105.0, 125.0, 150.0),
+    "never": (5.0, 20.0, 45.0, 70.0, 92.0, 85.0),
+    "touches": (30.0, 60.0, 100.0, 80.0, 40.0, 50.0),
+}
+"""Curves by what they do at the threshold."""
+
+
+@drawing
+def _curves(generator, *kinds, unit=1000.0):
+    """One run of each kind. Returns have a scale and a shift of their own, and each is drawn anew on its side of the threshold; one
+    that equals the threshold still does."""
+    shape = torch.tensor([RUNS[kind] for kind in kinds], dtype=torch.float64) - THRESHOLD
+    scale, shift = (1 + 4 * uniform(generator, 1)).item(), (50 * normal(generator, 1)).item()
+    stretched = shape * (0.9 + 0.2 * uniform(generator, *shape.shape))
+    gaps = unit * (0.5 + uniform(generator, shape.shape[1]))
+    # on a grid of powers of two, threshold + returns - threshold is exact: a curve that touches touches
+    threshold = round(shift * 64) / 64
+    return {"steps": gaps.cumsum(0), "returns": threshold + (scale * stretched * 64).round() / 64, "threshold": threshold}
+
+
+def _cut(given, count):
+    """The first evaluations alone."""
+    return {"steps": given["steps"][:count], "returns": given["returns"][:, :count]}
+
+
+def _stuck(given):
+    """Two evaluations at one step."""
+    steps = given["steps"].clone()
+    steps[3] = steps[2]
+    return {"steps": steps}
+
+
+_timed = versions_of(
+    ch48.steps_to_threshold,
+    satisfies(lambda returns, steps: returns.dim() == 2 and steps.dim() == 1 and returns.shape[1] == len(steps)),
+    satisfies(lambda steps: bool((steps[1:] > steps[:-1]).all())),
+)
+
+
+def _each(of_run, checked=True):
+    """A version, run by run: `of_run(s, r, threshold)` takes lists."""
+
+    def version(steps, returns, threshold):
+        found = [of_run(steps.tolist(), run, float(threshold)) for run in returns.tolist()]
+        return torch.tensor(found, dtype=returns.dtype)
+
+    return _timed(version, checked)
+
+
+def _first(r, threshold):
+    """The place of the first evaluation at the threshold or above, None if there is none."""
+    return next((k for k, value in enumerate(r) if value >= threshold), None)
+
+
+def _between(s, r, k, threshold):
+    """Where the line from evaluation k - 1 to k is at the threshold."""
+    return s[k - 1] + (threshold - r[k - 1]) / (r[k] - r[k - 1]) * (s[k] - s[k - 1])
+
+
+def _crossing(k, s, r, threshold, never=math.inf):
+    return never if k is None else s[0] if k == 0 else _between(s, r, k, threshold)
+
+
+def _right(s, r, threshold, **given):
+    return _crossing(_first(r, threshold), s, r, threshold, **given)
+
+
+def _at_evaluation(s, r, threshold):
+    k = _first(r, threshold)
+    return math.inf if k is None else s[k]
+
+
+def _before_it(s, r, threshold):
+    k = _first(r, threshold)
+    return math.inf if k is None else s[max(k - 1, 0)]
+
+
+def _for_good(s, r, threshold):
+    """From where on it stays at the threshold or above."""
+    below = [k for k, value in enumerate(r) if value < threshold]
+    k = below[-1] + 1 if below else 0
+    return _crossing(k if k < len(r) else None, s, r, threshold)
+
+
+def _above_only(s, r, threshold):
+    return _crossing(next((k for k, value in enumerate(r) if value > threshold), None), s, r, threshold)
+
+
+def _at_the_best(s, r, threshold):
+    return s[r.index(max(r))] if max(r) >= threshold else math.inf
+
+
+def _nearest(s, r, threshold):
+    return min(zip(r, s, strict=True), key=lambda pair: abs(pair[0] - threshold))[1] if max(r) >= threshold else math.inf
+
+
+def _by_running_best(s, r, threshold):
+    return _right(s, list(itertools.accumulate(r, max)), threshold)
+
+
+def _wrapped(s, r, threshold):
+    """An index of -1 at the first evaluation."""
+    k = _first(r, threshold)
+    return math.inf if k is None else _between(s, r, k, threshold)
+
+
+def _from_nothing(s, r, threshold):
+    """Every curve begins with a return of 0 at no steps."""
+    k = _first(r, threshold)
+    return math.inf if k is None else _between([0.0, *s], [0.0, *r], k + 1, threshold) if r[k] else s[k]
+
+
+def _other_share(s, r, threshold):
+    k = _first(r, threshold)
+    return math.inf if k is None else s[0] if k == 0 else s[k - 1] + s[k] - _between(s, r, k, threshold)
+
+
+def _in_the_middle(s, r, threshold):
+    k = _first(r, threshold)
+    return math.inf if k is None else s[0] if k == 0 else 0.5 * (s[k - 1] + s[k])
+
+
+def _as_weights(s, r, threshold):
+    k = _first(r, threshold)
+    if not k:
+        return math.inf if k is None else s[0]
+    after, before = r[k] - threshold, threshold - r[k - 1]
+    return (after * s[k - 1] + before * s[k]) / (after + before)
+
+
+def _of_the_mean_curve(steps, returns, threshold):
+    mean = returns.mean(0)
+    return torch.full((len(returns),), _right(steps.tolist(), mean.tolist(), float(threshold)), dtype=returns.dtype)
+
+
+def _all_segments(steps, returns, threshold):
+    """A variant: every segment that crosses upwards, and the earliest of them."""
+    low, high = returns[:, :-1], returns[:, 1:]
+    at = steps[:-1] + (threshold - low) / (high - low) * steps.diff()
+    crossing = torch.where((low < threshold) & (high >= threshold), at, math.inf)
+    begun = torch.where(returns[:, :1] >= threshold, steps[:1], math.inf)
+    return torch.cat([begun, crossing], 1).amin(1).to(returns.dtype)
+
+
+def _by_counting(steps, returns, threshold):
+    """A variant: evaluations before the first that reaches are counted."""
+    before = ((returns >= threshold).cumsum(1) == 0).sum(1)
+    found = []
+    for run, k in zip(returns, before.tolist(), strict=True):
+        if 0 < k < len(steps):
+            found.append(torch.lerp(steps[k - 1], steps[k], ((threshold - run[k - 1]) / (run[k] - run[k - 1])).to(steps.dtype)))
+        else:
+            found.append(steps[0] if k == 0 else torch.tensor(math.inf))
+    return torch.stack([one.to(returns.dtype) for one in found])
+
+
+_WRONG_STEPS_TO_THRESHOLD = {
+    "first-evaluation-above": (
+        _at_evaluation,
+        "This is the evaluation by which the threshold is reached, which depends on how often one evaluates: interpolate between it and"
+        " the one before.",
+    ),
+    "last-evaluation-below": (
+        _before_it,
+        "This is the last evaluation before the threshold is reached: interpolate between it and the next.",
+    ),
+    "half-way": (
+        _in_the_middle,
+        "The middle between two evaluations is taken: the curve is at the threshold nearer to the one whose return is nearer.",
+    ),
+    "share-of-the-other-side": (
+        _other_share,
+        "The share counts from the evaluation before: (threshold - before) / (after - before).",
+    ),
+    "never-is-the-last-step": (
+        lambda *given: _right(*given, never=given[0][-1]),
+        "A run that never reaches the threshold counts as if it had done so at its last step. It is censored: infinity, so that no"
+        " statistic takes it for a success.",
+    ),
+    "never-is-the-first-step": (
+        lambda *given: _right(*given, never=given[0][0]),
+        "A run that never reaches the threshold gets the first step: argmax of a row of False is 0. Ask `any` as well, and return"
+        " infinity.",
+    ),
+    "never-is-nan": (
+        lambda *given: _right(*given, never=math.nan),
+        "A run that never reaches the threshold is not unknown: it is later than all others. Infinity can be sorted, nan cannot.",
+    ),
+    "never-is-minus-one": (
+        lambda *given: _right(*given, never=-1.0),
+        "A run that never reaches the threshold is the slowest of all, and -1 makes it the fastest: return infinity.",
+    ),
+    "for-good": (
+        _for_good,
+        "This is where the curve stays above from then on. Asked for is where it *first* reaches the threshold, lost again or not.",
+    ),
+    "strictly-above": (_above_only, "A return that equals the threshold reaches it: ≥, not >."),
+    "at-the-best": (_at_the_best, "This is where the run was best, not where it first was good enough."),
+    "nearest-return": (
+        _nearest,
+        "This is where the return is nearest to the threshold, before or after it was reached: take the first that is no less.",
+    ),
+    "running-best": (
+        _by_running_best,
+        "The line is drawn from the best return so far. It goes from the evaluation before, which may be lower.",
+    ),
+    "before-the-first-wraps": (
+        _wrapped,
+        "At the first evaluation there is none before it, and index -1 is the last one: a run that begins above has reached the"
+        " threshold there.",
+    ),
+    "begins-at-nothing": (
+        _from_nothing,
+        "A curve is continued to a return of 0 at 0 steps, which nobody evaluated: a run that begins above has reached the threshold at"
+        " its first evaluation.",
+    ),
+}
+
+STEPS_TO_THRESHOLD = Exercise(
+    name="steps_to_threshold",
+    reference=ch48.steps_to_threshold,
+    criteria={"values": 1.6, "dtype": 0.1, "inputs": 0.1, "errors": 0.2},
+    axes=("run",),
+    cases=drawn_once(
+        Case("a run that climbs", _curves("climbs"), visible=True, draws=2),
+        Case("runs that dip and wander", _curves("dips before", "wanders", "late"), visible=True, draws=2),
+        Case("one that loses it again", _curves("loses it", "climbs"), visible=True),
+        Case("one that never does", _curves("climbs", "never", "late"), visible=True),
+        Case("none ever does", _curves("never", "never"), closed_form=number(math.inf, math.inf)),
+        Case("one that begins above", _curves("begins above", "wanders"), visible=True),
+        Case("one that touches", _curves("touches", "never"), visible=True, draws=2),
+        Case("all kinds, in seconds", _curves(*RUNS, unit=7.0), draws=2),
+        Case("as many runs as evaluations", _curves("climbs", "late", "wanders", "never", "loses it", "touches")),
+        Case("a single evaluation", altered(_curves("begins above", "never"), lambda x: _cut(x, 1)), visible=True),
+        Case("single precision", _curves("climbs", "never", "late"), dtype=torch.float32, visible=True),
+        Case("steps do not increase", altered(_curves("climbs", "late"), _stuck), raises=["steps"], visible=True, draws=1),
+        misshapen(
+            "returns without their first evaluation",
+            _curves("climbs"),
+            "returns",
+            lambda r: r[:, 1:],
+            ["returns", "steps"],
+            draws=1,
+        ),
+        misshapen(
+            "returns of one run, (T,)", _curves("climbs"), "returns", lambda r: r[0], ["returns", "steps"], visible=True, draws=1
+        ),
+    ),
+    misconceptions=(
+        *wrong(_WRONG_STEPS_TO_THRESHOLD, _each),
+        Misconception(
+            "of-the-mean-curve",
+            _timed(_of_the_mean_curve),
+            "All runs get the time at which their mean reaches the threshold: each run has a time of its own.",
+        ),
+        *spoilt(ch48.steps_to_threshold, dtype_lost, changed="returns"),
+        bad_input_accepted(_each(_right, checked=False)),
+    ),
+    variants={
+        "run by run": _each(_right),
+        "all segments, the earliest": _timed(_all_segments),
+        "evaluations counted": _timed(_by_counting),
+        "as a weighted mean": _each(_as_weights),
+    },
+)
+
 # --------------------------------------------------------------------------------------------------- repaired_transitions
 
 _ROWS = ("sent", "rewards", "truncated")
@@ -470,6 +751,10 @@ _WRONG_ACTIONS = {
     "to-the-unit-interval": (
         lambda sent, low, high: (sent - low) / (high - low),
         "These actions lie in [0, 1]: half of the range that the policy chooses from is missing.",
+    ),
+    "bounds-written-in": (
+        lambda sent, low, high: 2 * sent - 1,
+        "This undoes the scaling of one motor, which takes 0 to 1: low and high say what this one takes.",
     ),
     "divided-by-the-upper-bound": (
         lambda sent, low, high: sent / high,
@@ -551,5 +836,6 @@ REPAIRED_TRANSITIONS = Exercise(
 EXERCISES = (
     INTERQUARTILE_MEAN,
     BOOTSTRAP_INTERVAL,
+    STEPS_TO_THRESHOLD,
     REPAIRED_TRANSITIONS,
 )

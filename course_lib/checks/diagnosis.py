@@ -91,10 +91,10 @@ def diagnose(exercise: FrozenExercise, observations: Sequence[Observation]) -> F
         return Finding(exercise.name, "correct", exercise.points, exercise.points)
     paid = 0.0 if "values" in failed else sum(points for facet, points in exercise.criteria.items() if facet not in failed)
     named = _explanations(exercise, pairs, failed)
-    crashed = next((seen for (_, seen), facets in zip(pairs, differing, strict=True) if "values" in facets and seen.error), None)
+    crashed = next((pair for pair, facets in zip(pairs, differing, strict=True) if "values" in facets and pair[1].error), None)
     state = "partial" if paid else "error" if crashed and not named else "wrong"
     lines = [f"Looks like {name}: {exercise.messages[name]}" for name in named]
-    lines += _descriptions(exercise, pairs, differing, failed)
+    lines += _descriptions(exercise, pairs, differing, failed, crashed if state == "error" else None)
     return Finding(exercise.name, state, round(paid, 4), exercise.points, named, "\n".join(lines), failed)
 
 
@@ -230,12 +230,18 @@ def _explaining(
 
 
 def _descriptions(
-    exercise: FrozenExercise, pairs: list[tuple[FrozenCase, Observation]], differing: list[set[str]], failed: list[str]
+    exercise: FrozenExercise,
+    pairs: list[tuple[FrozenCase, Observation]],
+    differing: list[set[str]],
+    failed: list[str],
+    crashed: tuple[FrozenCase, Observation] | None = None,
 ) -> list[str]:
-    """A line for each failed facet, from the first case that shows it; once the values are wrong, they alone are described."""
+    """A line for each failed facet, from the first case that shows it, or from the one that `crashed` where that is the verdict; once
+    the values are wrong, they alone are described.
+    """
     lines = []
     for facet in ["values"] if "values" in failed else failed:
-        case, seen = next(pair for pair, facets in zip(pairs, differing, strict=True) if facet in facets)
+        case, seen = crashed or next(pair for pair, facets in zip(pairs, differing, strict=True) if facet in facets)
         describe: dict[str, Callable[[FrozenExercise, FrozenCase, Observation], str]] = {
             "values": _describe_values,
             "gradient": _describe_gradient,

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from course_lib.control import sac
 from course_lib.control.replay import Transitions
 from solutions import ch47
-from solutions.ch48 import bootstrap_interval, fast_sac_update, interquartile_mean
+from solutions.ch48 import bootstrap_interval, fast_sac_update, interquartile_mean, steps_to_threshold
 
 TAUGHT = sac.Taught.of(vars(ch47))
 SMALL = sac.SACSettings(total_steps=300, learning_starts=50, batch_size=16, hidden=8)
@@ -48,6 +48,39 @@ def test_interval_covers_and_narrows_and_is_drawn_from_its_generator_only():
     narrow = bootstrap_interval(scores, confidence=0.5, generator=seeded())
     assert wide == again and wide != bootstrap_interval(scores, generator=seeded(5))
     assert wide[0] < narrow[0] < interquartile_mean(scores) < narrow[1] < wide[1]
+
+
+@pytest.mark.parametrize(
+    ("returns", "expected"),
+    [
+        ([0.0, 0, 10, 20], 150),  # half-way up the second line
+        ([9.0, 0, 10, 20], 0),  # from the beginning, and lost again
+        ([0.0, 5, 0, 0], 100),  # touched
+        ([0.0, 4, 3, 4], torch.inf),
+        ([0.0, 20, 0, 20], 25),  # for the first time
+    ],
+)
+def test_steps_to_threshold_by_hand(returns, expected):
+    steps = torch.tensor([0.0, 100, 200, 300])
+    assert steps_to_threshold(steps, torch.tensor([returns, [7.0, 7, 7, 7]]), 5).tolist() == [expected, 0]
+
+
+@given(st.lists(st.floats(-100, 100), min_size=2, max_size=12), st.floats(-100, 100), st.floats(0, 50))
+@settings(max_examples=50, deadline=None)
+def test_a_higher_threshold_is_never_reached_earlier(returns, threshold, more):
+    returns = torch.tensor([returns], dtype=torch.float64)
+    steps = torch.arange(returns.shape[1], dtype=torch.float64)
+    sooner, later = (steps_to_threshold(steps, returns, at) for at in (threshold, threshold + more))
+    assert (sooner <= later + 1e-9).all() and (sooner.isinf() == (returns < threshold).all(1)).all()
+
+
+@pytest.mark.parametrize(
+    ("steps", "returns", "name"),
+    [([0.0, 1, 2], [[1.0, 2]], "returns"), ([0.0, 1], [1.0, 2], "returns"), ([0.0, 0], [[1.0, 2]], "steps")],
+)
+def test_steps_to_threshold_refuses_what_does_not_fit(steps, returns, name):
+    with pytest.raises(ValueError, match=name):
+        steps_to_threshold(torch.tensor(steps), torch.tensor(returns), 1)
 
 
 def random_steps(size=32, seed=0):

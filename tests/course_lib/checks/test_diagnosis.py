@@ -1,5 +1,7 @@
 """Diagnosis on a toy exercise: what is paid, what is named, what is said, and that nobody is accused falsely."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -113,6 +115,23 @@ def test_wrong_shapes_kinds_and_exceptions_are_described():
     assert "(6,)" in finding(lambda x, ended, gamma=0.5: double(x, ended, gamma).flatten()).message
     assert "a float" in finding(lambda x, ended, gamma=0.5: 1.0).message
     assert finding(crash).state == "error" and "IndexError: t out of range" in finding(crash).message
+
+
+def test_an_answer_that_stops_is_shown_where_it_stops():
+    """And not where its values are wrong, in an earlier case: the verdict above the evidence says that it stops."""
+
+    def crashing(x, ended, gamma=0.5):
+        return [3 * x * ~ended][int(gamma)]
+
+    whole = Case("gamma = 1", lambda generator: _table(generator) | {"gamma": 1.0}, visible=True)
+    named = Misconception("crashing", crashing, "Mind the size.")
+    unknown = dataclasses.replace(TOY, cases=(*TOY.cases, whole))
+    known = dataclasses.replace(unknown, misconceptions=(*TOY.misconceptions, named))
+    stopped, explained = (finding(crashing, freeze.visible(one)) for one in (unknown, known))
+    assert stopped.state == "error" and stopped.message.startswith(
+        "Case “gamma = 1”: It raises IndexError: list index out of range"
+    )
+    assert (explained.state, explained.misconceptions) == ("wrong", ["crashing"]) and "Case “table”" in explained.message
 
 
 def test_an_error_must_be_a_value_error_that_names_the_argument():
