@@ -275,7 +275,8 @@ def _remedy(exercise: FrozenExercise, seen: Observation) -> str:
 def _describe_values(exercise: FrozenExercise, case: FrozenCase, seen: Observation) -> str:
     right = case.expected[0]
     if not _same_form(seen, right):
-        return f"It returns {with_article(seen.kind)} where {with_article(right.kind)} is asked for."
+        found = re.sub(r"\btuple\b", "list or tuple", with_article(seen.kind))  # either counts as the other
+        return f"It returns {found} where {with_article(right.kind)} is asked for."
     for key, want in right.outputs.items():
         got = seen.outputs[key]
         label = f"Output {key}: " if key else ""

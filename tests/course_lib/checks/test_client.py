@@ -90,6 +90,13 @@ def test_what_calls_a_right_one_has_its_own_fault():
     assert "td_residuals" not in repr(check(notebook["compute_gae"]))
 
 
+def test_a_list_is_not_called_a_tuple():
+    def compute_gae(*args, **kwargs):
+        return [1.0, 2.0]
+
+    assert "It returns a list or tuple of 2 (float, float) where a tensor is asked for." in repr(check(compute_gae))
+
+
 def test_html_escapes_what_a_learner_raises():
     def compute_gae(*args, **kwargs):
         raise RuntimeError("<script>alert(1)</script>")
