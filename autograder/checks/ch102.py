@@ -1317,6 +1317,12 @@ PARTING_ONES = Exercise(
         "one rollout after another": _parts(_knowing_all(_parting_by_hand)),
         "all gaps in one table": _parts(_parting()),
         "two rules at a time": _parts(_knowing_all(_parting_by_pairs)),
+        "distances, none from a rule to itself": _parts(
+            _parting(
+                gap=lambda difference, _truncated: torch.linalg.vector_norm(difference, torch.inf, (0, 1)),
+                parts=lambda gaps: (gaps + torch.eye(len(gaps))[..., None] > 1e-3).flatten(0, 1).all(0),
+            )
+        ),
     },
 )
 
