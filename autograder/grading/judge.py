@@ -434,9 +434,8 @@ class _Run:
     def _compared(self, exercise: FrozenExercise, seen: list[Observation]) -> Finding:
         try:
             if isinstance(exercise, FrozenTuning) and exercise.train:
-                return judged(
-                    exercise, seen[0], exercise.train
-                )  # numbers in known ranges come from the sandbox; the training is ours
+                # numbers in known ranges come from the sandbox; the training is ours
+                return judged(exercise, seen[0], exercise.train)
             return diagnose(exercise, [view(case, one) for case, one in zip(exercise.cases, seen, strict=True)])
         except Exception as error:  # no answer, however odd, may end the grading; a person must look at this one
             self._flag(f"{NOT_COMPARED}: {exercise.name} ({type(error).__name__})")

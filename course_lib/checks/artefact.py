@@ -10,6 +10,7 @@ import json
 import math
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -43,10 +44,23 @@ def load(path: Path) -> FrozenArtefact:
     return FrozenArtefact(**json.loads(path.read_text(encoding="utf-8")))
 
 
-def score(artefact: FrozenArtefact, mean_return: float) -> float:
+class ByReturn(Protocol):
+    """An exercise whose points are for a mean return: none at `low` or less, all at `high` or more."""
+
+    @property
+    def points(self) -> float: ...
+
+    @property
+    def low(self) -> float: ...
+
+    @property
+    def high(self) -> float: ...
+
+
+def score(exercise: ByReturn, mean_return: float) -> float:
     """The points for a mean return: a straight line from 0 at `low` to all at `high`, in hundredths, rounded down."""
-    share = (mean_return - artefact.low) / (artefact.high - artefact.low)
-    return artefact.points if share >= 1 else math.floor(100 * artefact.points * max(share, 0.0)) / 100
+    share = (mean_return - exercise.low) / (exercise.high - exercise.low)
+    return exercise.points if share >= 1 else math.floor(100 * exercise.points * max(share, 0.0)) / 100
 
 
 def landed(artefact: FrozenArtefact, returns: np.ndarray) -> Finding:

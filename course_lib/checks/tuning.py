@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from course_lib.checks.artefact import score
 from course_lib.checks.cases import FrozenCase, FrozenExercise, Observation
 from course_lib.checks.diagnosis import Finding, with_article
 from course_lib.checks.observing import observe
@@ -52,12 +53,6 @@ def save(path: Path, exercise: FrozenTuning) -> None:
 def load(path: Path) -> FrozenTuning:
     """Read what `save` wrote."""
     return frozen(**json.loads(path.read_text(encoding="utf-8")))
-
-
-def score(exercise: FrozenTuning, mean_return: float) -> float:
-    """The points for a mean return: a straight line from 0 at `low` to all at `high`, in hundredths, rounded down."""
-    share = (mean_return - exercise.low) / (exercise.high - exercise.low)
-    return exercise.points if share >= 1 else math.floor(100 * exercise.points * max(share, 0.0)) / 100
 
 
 def examine_here(exercise: FrozenTuning, function: Callable) -> Finding:
