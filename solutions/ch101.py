@@ -76,7 +76,8 @@ def group_advantages(rewards, group_size, baseline="mean", scale="group", eps=1e
         "group", or of the whole "batch", each plus eps; or by nothing, "none".
       eps: ε > 0, in units of reward.
 
-    Returns: (P G,) advantages without a graph; 0 in a group of equal rewards.
+    Returns: (P G,) advantages without a graph; 0 in a group of equal rewards, up to rounding,
+      which a small eps makes large.
     Raises: ValueError that names an argument if group_size < 2, the rewards are not a whole
       number of groups, or baseline or scale is another word.
     """
