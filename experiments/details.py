@@ -1,8 +1,9 @@
 """Implementation details on CartPole: the actor-critic of chapter 44, and the same with one detail changed.
 
 A variant is `page`, the program of the chapter's second experiment as it stands, or that program with what `CHANGES` lists beside its name.
-`bad_units` shows the positions (of the cart and of the pole) in units a hundred times smaller. Observations and rewards are normalised
-as is usual: by statistics of all steps so far, which go on changing, and then clipped at ten. The return is that of the task itself.
+`constant_critic_…` has a critic that says one number of every state. `bad_units` shows the positions (of the cart and of the pole) in
+units a hundred times smaller. Observations and rewards are normalised as is usual: by statistics of all steps so far, which go on
+changing, and then clipped at ten. The return is that of the task itself.
 """
 
 from __future__ import annotations
@@ -61,9 +62,12 @@ CHANGES: dict[str, dict[str, Any]] = {
     "lambda_1": {"gae_lambda": 1.0},
     "long": {"num_envs": 8, "num_steps": 128},
     "long_lambda_1": {"num_envs": 8, "num_steps": 128, "gae_lambda": 1.0},
+    "constant_critic_0": {"constant_critic": 0.0},
+    "constant_critic_45": {"constant_critic": 45.0},
 }
 VARIANTS: dict[str, dict[str, Any]] = {variant: PAGE | changes for variant, changes in CHANGES.items()}
-SEEDS = 10
+CLOSE = ("page", "advantages_as_they_are", "advantages_centred", "advantages_divided")  # ten seeds do not tell them apart
+SEEDS = dict.fromkeys(VARIANTS, 10) | dict.fromkeys((*CLOSE, "constant_critic_0", "constant_critic_45"), 20)
 WEIGHTS = {
     "normalised": normalize_advantages,
     "as they are": lambda advantages: advantages,
@@ -150,6 +154,18 @@ def mlp(num_inputs: int, num_outputs: int) -> nn.Module:
     return nn.Sequential(nn.Linear(num_inputs, 64), nn.Tanh(), nn.Linear(64, num_outputs))
 
 
+class Constant(nn.Module):
+    """A critic that says the same of every state, and never learns."""
+
+    def __init__(self, value: float) -> None:
+        super().__init__()
+        self.value = value
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        """Observations (*shape, 4) to values (*shape, 1)."""
+        return torch.full((*obs.shape[:-1], 1), self.value)
+
+
 def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> list[dict[str, Any]]:
     """Train once; it takes seconds, so that no checkpoint is kept. Rows are updates."""
     with_ = VARIANTS[variant]
@@ -159,6 +175,8 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> list[d
     envs = Seen(recorder, **{name: with_[name] for name in seen})
     obs, _ = envs.reset(seed=seed)
     actor, critic = mlp(4, 2), mlp(4, 1)
+    if "constant_critic" in with_:
+        critic = Constant(with_["constant_critic"])
     optimizer = torch.optim.Adam([*actor.parameters(), *critic.parameters()], lr=with_["learning_rate"])
     rows = []
 

@@ -2,7 +2,8 @@
 
 A run is a set of eight trainings: the summary has the mean return that each of the policies flies. "centre" has the settings of chapter
 45's lander, with rollouts and minibatches for a sixteenth of the steps and a shorter horizon. The settings tried (`SETTING_VALUE`) are
-each one change of it, three values on either side for each of five settings.
+each one change of it, three values on either side for each of five settings. The ablations (`PARTS`) change what is not to be tuned, too,
+some of them at ten times the learning rate; they, and what they are compared with, are three runs each.
 """
 
 from __future__ import annotations
@@ -33,28 +34,41 @@ TRIED: dict[str, tuple[float, ...]] = {
 CHOSEN: dict[str, Mapping[str, float]] = {"centre": CENTRE} | {
     f"{name}_{value:g}": {**CENTRE, name: value} for name, values in TRIED.items() for value in values
 }
+INFINITE = float("inf")
+FAST = {"learning_rate": 1e-2}
+PARTS: dict[str, Mapping[str, float]] = {
+    "no_clip": {"clip_range": INFINITE},
+    "no_normalisation": {"normalize_advantages": False},
+    "entropy_bonus": {"ent_coef": 0.01},
+    "fast_no_clip": FAST | {"clip_range": INFINITE},
+    "fast_target_kl": FAST | {"clip_range": INFINITE, "target_kl": 0.02},
+}
+COMPARED = ("centre", "learning_rate_0.01", "gae_lambda_0", "gae_lambda_1")
 
 
-def configuration(chosen: Mapping[str, float]) -> dict:
+def configuration(chosen: Mapping[str, float], changes: Mapping[str, float] | None = None) -> dict:
     """What a record says of a set of trainings with these settings."""
     about = {"trainings": TRAININGS, "drones": tuning.DRONES, "gust": tuning.GUST}
-    return about | asdict(tuning.tuned(chosen)) | {"target_kl": "infinity"}
+    settings = asdict(tuning.tuned(chosen).but(**changes or {}))
+    return about | {name: "infinity" if value == INFINITE else value for name, value in settings.items()}
 
 
 VARIANTS = {variant: configuration(chosen) for variant, chosen in CHOSEN.items()}
-SEEDS = 1
+VARIANTS |= {variant: configuration(CENTRE, changes) for variant, changes in PARTS.items()}
+SEEDS = dict.fromkeys(VARIANTS, 1) | dict.fromkeys((*PARTS, *COMPARED), 3)
 
 
 def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result:
     """Make a set of trainings; a run of a second or two keeps no checkpoint."""
-    return made(CHOSEN[variant], seed, report)
+    return made(CHOSEN.get(variant, CENTRE), seed, report, PARTS.get(variant))
 
 
-def made(chosen: Mapping[str, float], seed: int, report: Report) -> Result:
-    """Eight trainings, no two of them with one seed."""
+def made(chosen: Mapping[str, float], seed: int, report: Report, changes: Mapping[str, float] | None = None) -> Result:
+    """Eight trainings, no two of them with one seed; `changes` may be of settings that are not to be tuned."""
     rows: list[dict] = []
+    settings = tuning.tuned(chosen).but(**changes or {})
     for number in range(TRAININGS):
-        (value,), told = tuning.trainings(_train, tuning.tuned(chosen), [FIRST_SEED + TRAININGS * seed + number])
+        (value,), told = tuning.trainings(_train, settings, [FIRST_SEED + TRAININGS * seed + number])
         rows.append({"training": number, "mean_return": float(value)} | told)
         report(number + 1, TRAININGS)
     return Result(rows, {"eval_returns": [round(row["mean_return"], 3) for row in rows]})

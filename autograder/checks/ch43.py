@@ -359,6 +359,11 @@ def _clipped_to(bounds):
     return _clipped_loss(lambda r, a, e: -torch.minimum(r * a, r.clamp(*bounds(e)) * a).mean())
 
 
+def _dual_clip(r, a, e):
+    once = torch.minimum(r * a, r.clamp(1 - e, 1 + e) * a)
+    return -torch.where(a < 0, once.maximum(3 * a), once).mean()
+
+
 def _limits(r, a, e):
     """OpenAI Spinning Up's way to write it, which for A = 0 and an infinite range is 0 times infinity."""
     return -torch.minimum(r * a, torch.where(a > 0, (1 + e) * a, (1 - e) * a)).mean()
@@ -415,6 +420,10 @@ _WRONG_CLIPPED_LOSSES = _wrong_losses(clip, ch43.clipped_surrogate_loss, _NOT_NE
     "product-clipped": (
         _clipped_loss(lambda r, a, e: -torch.minimum(r * a, (r * a).clamp(1 - e, 1 + e)).mean()),
         "The ratio is clipped, then multiplied by the advantage; here the product is clipped.",
+    ),
+    "dual-clip": (
+        _clipped_loss(_dual_clip),
+        "This is the dual clip, with a floor for bad actions: PPO's own pulls on them, however likely they have become.",
     ),
     "minimum-of-means": (
         _clipped_loss(lambda r, a, e: -torch.minimum((r * a).mean(), (r.clamp(1 - e, 1 + e) * a).mean())),

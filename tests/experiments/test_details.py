@@ -57,6 +57,13 @@ def test_statistics_of_the_first_observations_stay():
     assert wrapped.obs_seen.count == 9
 
 
+def test_a_constant_critic_says_one_number_and_leaves_the_first_rollout_as_it_was(tmp_path, monkeypatch):
+    monkeypatch.setattr(details, "UPDATES", 2)
+    page, constant = (details.run(name, 0, tmp_path, lambda *at: None) for name in ("page", "constant_critic_45"))
+    assert page[0]["mean_return"] == constant[0]["mean_return"] and page[-1] != constant[-1]
+    assert details.Constant(45.0)(torch.zeros(3, 2, 4)).tolist() == [[[45.0], [45.0]]] * 3
+
+
 @pytest.mark.parametrize("unit", [0.1, 100.0])
 def test_scaled_rewards_do_not_know_their_unit(unit):
     plain, other = walked(scaled_rewards=True)[0], walked(scaled_rewards=True, reward_unit=unit)[0]

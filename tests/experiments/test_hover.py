@@ -17,6 +17,20 @@ def test_there_are_three_values_on_either_side_of_the_centre(name):
         assert {key for key in changed if changed[key] != hover.VARIANTS["centre"][key]} == {name}
 
 
+def test_an_ablation_changes_what_it_says_and_is_compared_over_the_same_trainings():
+    for variant, changes in hover.PARTS.items():
+        told, centre = hover.VARIANTS[variant], hover.VARIANTS["centre"]
+        assert {key for key in told if told[key] != centre[key]} == set(changes)
+        assert hover.SEEDS[variant] == hover.SEEDS["centre"] == hover.SEEDS["learning_rate_0.01"] == 3
+
+
+def test_a_run_of_an_ablation_trains_with_its_change(tmp_path, monkeypatch):
+    given = []
+    monkeypatch.setattr(tuning, "trainings", lambda train, settings, seeds: given.append(settings) or (np.zeros(1), {}))
+    hover.run("fast_target_kl", 0, tmp_path, lambda done, total: None)
+    assert {(one.learning_rate, one.clip_range, one.target_kl) for one in given} == {(0.01, np.inf, 0.02)}
+
+
 def test_the_centre_is_the_landers_but_for_its_size_and_horizon():
     centre = tuning.tuned(hover.CENTRE)
     same = {name for name in hover.CENTRE if getattr(centre, name) == getattr(LANDER_SETTINGS, name)}
