@@ -1,10 +1,10 @@
 """DPO on human ratings with the tiny language model: weights beta, other losses, an unfrozen reference, a silent bug (chapter 97).
 
 Every variant begins with the fine-tuned policy of the experiment rlhf and learns from some of the comparisons that the reward model there
-has, in one epoch, "dpo_4000" from all of them; a run's seed is that of both. "coin" tosses a coin for every label. "own_texts" learns from
-that policy's own texts instead, best and worst of four as the reward model orders them, "own_texts_two" from two of each prompt;
-"own_texts_twice" from as many, of which the second half are written by the policy as it is by then. "whole_picked" learns from the best
-and the worst of four texts that people wrote, by the same reward model.
+has, in one epoch; a run's seed is that of both. "coin" tosses a coin for every label. "own_texts" learns from that policy's own texts
+instead, the best and the worst of four as the reward model orders them, "own_texts_two" from two of each prompt; "own_texts_twice" from as
+many, of which the second half are written by the policy as it is by then. "whole_picked" learns from the best and the worst of four texts
+that people wrote, by the same reward model.
 A row stands for five steps; in some of them texts of the policy as it is then are looked at. At the end it is judged on prompts and on
 rated texts that it has not seen.
 """
@@ -48,7 +48,6 @@ VARIANTS: dict[str, dict] = {
     "own_texts_two": COMMON | {"candidates": 2},
     "whole_picked": COMMON | {"labels": "reward model, best and worst of four"},
     "coin": COMMON | {"labels": "coin"},
-    "dpo_4000": COMMON | {"pairs": 4000, "look": 50},
 }
 SEEDS = 5
 ROWS = 5  # steps that a row stands for
