@@ -1,8 +1,10 @@
 """DPO on human ratings with the tiny language model: weights beta, other losses, an unfrozen reference, a silent bug (chapter 97).
 
 Every variant begins with the fine-tuned policy of the experiment rlhf and learns from some of the comparisons that the reward model there
-has, in one epoch; a run's seed is that of both. "own_texts" learns from that policy's own texts instead, as the reward model orders them;
-"own_texts_twice" from as many, of which the second half are written by the policy as it is by then.
+has, in one epoch; a run's seed is that of both. "coin" tosses a coin for every label. "own_texts" learns from that policy's own texts
+instead, the best and the worst of four as the reward model orders them, "own_texts_two" from two of each prompt; "own_texts_twice" from as
+many, of which the second half are written by the policy as it is by then. "whole_picked" learns from the best and the worst of four texts
+that people wrote, by the same reward model.
 A row stands for five steps; in some of them texts of the policy as it is then are looked at. At the end it is judged on prompts and on
 rated texts that it has not seen.
 """
@@ -43,6 +45,9 @@ VARIANTS: dict[str, dict] = {
     "reward_model": COMMON | {"loss": "reward model"},
     "own_texts": COMMON | {"candidates": 4, "look": 10},
     "own_texts_twice": COMMON | {"candidates": 4, "look": 10, "rounds": 2},
+    "own_texts_two": COMMON | {"candidates": 2},
+    "whole_picked": COMMON | {"labels": "reward model, best and worst of four"},
+    "coin": COMMON | {"labels": "coin"},
 }
 SEEDS = 5
 ROWS = 5  # steps that a row stands for
@@ -93,20 +98,41 @@ def comparisons(count: int, seed: int) -> preferences.Preferences:
     return replace(everything, **{name: getattr(everything, name)[:count] for name in names})
 
 
+def by_coin(asked: preferences.Preferences, seed: int) -> preferences.Preferences:
+    """The same pairs, and labels that say nothing."""
+    return preferences.flip_labels(asked, 0.5, torch.Generator().manual_seed(50_000 + seed))
+
+
+def picked(count: int, seed: int) -> preferences.Preferences:
+    """Of four texts at random, each time, the ones that chapter 96's reward model likes best and least; nobody else is asked."""
+    texts = preferences.load("reward_model").texts
+    drawn = torch.randint(len(texts), (count, 4), generator=torch.Generator().manual_seed(60_000 + seed))
+    scores = rlhf.reward_model(seed).scores(texts, last_token_scores)[drawn]
+    best, worst = (drawn.gather(1, index[:, None])[:, 0] for index in (scores.argmax(1), scores.argmin(1)))
+    return preferences.Preferences(texts, best, worst, torch.empty(0), torch.empty(0))
+
+
+def labelled(count: int, seed: int, labels: str) -> preferences.Preferences:
+    """Pairs of texts that people wrote."""
+    if labels == "two raters":
+        return comparisons(count, seed)
+    return by_coin(comparisons(count, seed), seed) if labels == "coin" else picked(count, seed)
+
+
 def encoded(model: lm.LanguageModel, asked: preferences.Preferences) -> Pairs:
     return encode_pairs(model, asked.chosen_texts, asked.rejected_texts)
 
 
 @functools.cache
 def prepared(
-    count: int, size: int, seed: int, padding_counts: bool, candidates: int
+    count: int, size: int, seed: int, padding_counts: bool, candidates: int, labels: str
 ) -> tuple[list[Pairs], list[torch.Tensor], float]:
     """One epoch of a seed, the reference's log-probabilities of it, and the processor time that took: once for all variants."""
     model = reference(seed)
-    if candidates:
+    if candidates or labels.startswith("reward model"):
         rlhf.reward_model(seed)  # its training is not part of the time
     begun = time.process_time()
-    pairs = own_texts(count, candidates, seed) if candidates else encoded(model, comparisons(count, seed))
+    pairs = own_texts(count, candidates, seed) if candidates else encoded(model, labelled(count, seed, labels))
     epoch = batches(pairs, size, padding_counts, torch.Generator().manual_seed(seed))
     return epoch, answered(model, epoch), time.process_time() - begun
 
@@ -137,7 +163,7 @@ def own_texts(count: int, candidates: int, seed: int, writer: lm.LanguageModel |
     """
     model, proxy = writer or reference(seed), Proxy(rlhf.reward_model(seed), last_token_scores)
     generator = torch.Generator().manual_seed(40_000 + seed + 1000 * first)
-    picked: list[list[torch.Tensor]] = []  # of each text, its own tokens and which of them are the completion's
+    taken: list[list[torch.Tensor]] = []  # of each text, its own tokens and which of them are the completion's
     for begin in range(first, first + count, PROMPTS_AT_A_TIME):
         prompts = openings("policy")[begin : min(first + count, begin + PROMPTS_AT_A_TIME)]
         samples = model.generate(
@@ -148,12 +174,12 @@ def own_texts(count: int, candidates: int, seed: int, writer: lm.LanguageModel |
         written = completion_mask(samples.input_ids, samples.prompt_lengths, model.end_id)
         for row in torch.stack([rows + scores.argmax(1), rows + scores.argmin(1)], 1).flatten().tolist():
             kept = samples.attention_mask[row]
-            picked.append([part[row][kept] for part in (samples.input_ids, samples.attention_mask, written)])
+            taken.append([part[row][kept] for part in (samples.input_ids, samples.attention_mask, written)])
     padding = (model.end_id, False, False)
     return Pairs(
         *(
             pad_sequence(list(part), batch_first=True, padding_value=value).unflatten(0, (-1, 2))
-            for part, value in zip(zip(*picked, strict=True), padding, strict=True)
+            for part, value in zip(zip(*taken, strict=True), padding, strict=True)
         )
     )
 
@@ -190,7 +216,8 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
     policy = reference(seed).frozen_copy().requires_grad_(True)
     rounds, candidates = choice.get("rounds", 1), choice.get("candidates", 0)
     size = choice["pairs"] // rounds
-    epoch, ref, seconds = prepared(size, choice["batch"], seed, padding_counts, candidates)
+    labels = choice.get("labels", "two raters")
+    epoch, ref, seconds = prepared(size, choice["batch"], seed, padding_counts, candidates, labels)
     unseen, unseen_ref = held_out(seed, padding_counts)
     optimizer = torch.optim.AdamW(policy.parameters(), lr=choice["learning_rate"], weight_decay=0.0, fused=True)
 

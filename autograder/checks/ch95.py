@@ -423,6 +423,11 @@ _WRONG_KL_PENALIZED_REWARDS = {
         _sum(paid_at=lambda m: torch.arange(m.shape[1]) == m.shape[1] - 1),
         "The last column is padding for most rows: the score belongs to each row's last kept token.",
     ),
+    "number-of-tokens-as-position": (
+        _sum(paid_at=lambda m: torch.arange(m.shape[1]) == m.sum(1, keepdim=True) - 1),
+        "The number of kept tokens less one is the last one's column only where the completion begins in the first column: look for the"
+        " largest column that is kept.",
+    ),
     "score-at-the-first-token": (
         _sum(paid_at=lambda m: m & (m.cumsum(1) == 1)),
         "argmax finds the first kept token: the score comes when the text is finished.",

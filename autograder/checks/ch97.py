@@ -349,6 +349,11 @@ _WRONG_DPO_LOSS = {
         _dpo(lambda gap, b, s: (1 - s) * F.softplus(-b * gap) - s * F.softplus(b * gap)),
         "Both terms are negative log-likelihoods and are added: -(1 - s) log σ(x) - s log σ(-x).",
     ),
+    "unbiased-for-turned-labels": (
+        _dpo(lambda gap, b, s: ((1 - s) * F.softplus(-b * gap) - s * F.softplus(b * gap)) / (1 - 2 * s)),
+        "This is the unbiased estimate of the loss for labels of which a share s is turned round, 'robust DPO': smoothing adds the two"
+        " terms, and divides by nothing." + wild.also("robust", "dpo_loss_smoothed_mean"),
+    ),
     "averaged": (
         _dpo(lambda gap, b, s: _smoothed(b * gap, s).mean().expand_as(gap)),
         "One loss for each pair is asked for; whoever calls the function averages.",
@@ -533,6 +538,13 @@ def _impossible_answer(generator):
     return drawn
 
 
+def _impossible_by_thousands(generator):
+    """The same, so far above the others that all of them vanish beside it."""
+    drawn = _impossible_answer(generator)
+    drawn["rewards"][2] = 60_000.0
+    return drawn
+
+
 def _two_answers(generator):
     """Odds of 1 to 1 become odds of e^(Δr / β) to 1."""
     rewards = torch.cat([normal(generator, 1), torch.zeros(1, dtype=torch.float64)])
@@ -604,6 +616,13 @@ _WRONG_KL_OPTIMAL_POLICY = {
         lambda p, r, b: p * (r / b).exp() / (p * (r / b).exp()).sum(-1, keepdim=True),
         "exp(r / beta) overflows, and inf / inf is not a number: subtract the largest exponent first, as softmax does.",
     ),
+    "largest-of-the-impossible": (
+        lambda p, r, b: (
+            p * ((r - r.amax(-1, keepdim=True)) / b).exp() / (p * ((r - r.amax(-1, keepdim=True)) / b).exp()).sum(-1, True)
+        ),
+        "The largest reward that is taken out belongs to an answer that the reference never gives: all others vanish beside it, and 0 / 0"
+        " is left. Take out the largest of log π_ref + r / beta, as softmax does.",
+    ),
     "impossible-made-possible": (
         lambda p, r, b: ((p + 1e-10).log() + r / b).softmax(-1),
         "A small number added to π_ref opens answers that the reference never gives, and a large reward finds them: log 0 = -inf"
@@ -628,6 +647,7 @@ KL_OPTIMAL_POLICY = Exercise(
         Case("equal rewards change nothing", _INDIFFERENT, closed_form=lambda ref_probs, **_rest: ref_probs, visible=True),
         Case("rewards of thousands", _answers(3, 5, scale=3000.0, beta=0.1), closed_form=_tilted, visible=True),
         Case("an answer that the reference never gives", _impossible_answer, closed_form=_tilted),
+        Case("such an answer, by far the best", _impossible_by_thousands, closed_form=_tilted, visible=True),
         Case("beta = 100: hardly any change", _answers(3, 5, beta=100.0), closed_form=_tilted),
         Case("single precision", _answers(4, 6), dtype=torch.float32, visible=True),
         *shape_cases(_answers(4, 6), _ANSWERS),

@@ -56,3 +56,23 @@ def test_own_texts_are_what_the_reward_model_likes_best_and_least_of_each_prompt
     assert (completion_mask <= attention_mask).all() and (completion_mask.sum(1) <= rlhf.PPO.new_tokens).all()
     ended = (input_ids == model.end_id) & completion_mask
     assert (ended.any(1) | (completion_mask.sum(1) == rlhf.PPO.new_tokens)).all(), "a text that was cut off has no end token"
+
+
+def test_a_coin_turns_labels_and_leaves_the_pairs_alone():
+    asked = direct.comparisons(400, seed=3)
+    tossed = direct.by_coin(asked, seed=3)
+    turned = tossed.chosen != asked.chosen
+    assert 150 < turned.sum() < 250
+    assert torch.equal(torch.where(turned, tossed.rejected, tossed.chosen), asked.chosen)
+    assert torch.equal(torch.where(turned, tossed.chosen, tossed.rejected), asked.rejected)
+
+
+def test_of_four_texts_that_people_wrote_the_reward_model_takes_the_best_and_the_worst(monkeypatch):
+    judge = RewardModel(lm.load("tiny"), seed=0).requires_grad_(False)
+    monkeypatch.setattr(rlhf, "reward_model", lambda seed: judge)
+    few, many = direct.picked(200, seed=0), direct.comparisons(200, seed=0)
+    (best, worst), (chosen, rejected) = (
+        [judge.scores(side, last_token_scores) for side in (asked.chosen_texts, asked.rejected_texts)] for asked in (few, many)
+    )
+    assert (best >= worst).all()
+    assert (best - worst).mean() > 1.4 * (chosen - rejected).abs().mean(), "four at random lie further apart than two"
