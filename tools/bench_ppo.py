@@ -19,6 +19,7 @@ import statistics
 import time
 from pathlib import Path
 
+import threadpoolctl
 import torch
 from rich.console import Console
 from rich.table import Table
@@ -99,6 +100,7 @@ def main():
     parser.add_argument("--record", type=Path, help="also write the result to this JSON file")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    threadpoolctl.threadpool_limits(1)  # NumPy's products would otherwise take all cores
 
     contestants = {
         "Stable-Baselines3": stable_baselines(),

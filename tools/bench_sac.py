@@ -21,6 +21,7 @@ import time
 from pathlib import Path
 
 import gymnasium as gym
+import threadpoolctl
 import torch
 from rich.console import Console
 from rich.table import Table
@@ -60,6 +61,7 @@ def main():
     parser.add_argument("--record", type=Path, help="also write the result to this JSON file")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    threadpoolctl.threadpool_limits(1)  # NumPy's products would otherwise take all cores
 
     contestants = {
         "Stable-Baselines3": stable_baselines(arguments.steps),

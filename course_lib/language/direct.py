@@ -87,7 +87,7 @@ def _hidden_of_rows(model: LanguageModel, pairs: Pairs) -> torch.Tensor:
     seen &= rows_of(attention_mask)[:, None, :] & torch.ones(width, width, dtype=torch.bool, device=model.device).tril()
     positions = rows_of((attention_mask.cumsum(-1) - 1).clamp(min=0))
     inputs = {"input_ids": rows_of(input_ids), "attention_mask": seen[:, None], "position_ids": positions}
-    hidden = model.network.base_model(**inputs).last_hidden_state
+    hidden = model.network.base_model(**inputs, use_cache=False).last_hidden_state
     return hidden[torch.arange(len(hidden), device=model.device)[:, None, None], places.clamp(max=width - 1)]
 
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 import copy
 import functools
 import importlib.util
+import itertools
 import os
 import urllib.request
 from collections.abc import Callable, Sequence
@@ -87,23 +88,24 @@ class LanguageModel(torch.nn.Module):
             [self.end_id, *row, *tail][: self.context]
             for row in self.tokenizer(list(texts), add_special_tokens=False)["input_ids"]
         ]
-        width = max(map(len, rows))
+        lengths = torch.tensor([len(row) for row in rows])[:, None]
+        width = int(lengths.max())
+        columns = torch.arange(width)
+        attention_mask = columns < lengths if side == "right" else columns >= width - lengths
         input_ids = torch.full((len(rows), width), self.end_id)
-        attention_mask = torch.zeros(len(rows), width, dtype=torch.bool)
-        for index, row in enumerate(rows):
-            columns = slice(0, len(row)) if side == "right" else slice(width - len(row), width)
-            input_ids[index, columns] = torch.tensor(row)
-            attention_mask[index, columns] = True
+        input_ids[attention_mask] = torch.tensor([token for row in rows for token in row])
         return Tokens(input_ids.to(self.device), attention_mask.to(self.device))
 
     def decode(self, input_ids: torch.Tensor, mask: torch.Tensor) -> list[str]:
         """The texts of the kept tokens, without end tokens; (B, L) each."""
-        kept = mask & (input_ids != self.end_id)
-        return self.tokenizer.batch_decode([row[keep].tolist() for row, keep in zip(input_ids, kept, strict=True)])
+        kept = (mask & (input_ids != self.end_id)).tolist()
+        return self.tokenizer.batch_decode(
+            [list(itertools.compress(*both)) for both in zip(input_ids.tolist(), kept, strict=True)]
+        )
 
     def hidden(self, input_ids: torch.Tensor, attention_mask: torch.Tensor) -> torch.Tensor:
         """What the last layer knows at every position; (B, L, D). What it is at padding means nothing."""
-        return self.network.base_model(**_inputs(input_ids, attention_mask)).last_hidden_state
+        return self.network.base_model(**_inputs(input_ids, attention_mask), use_cache=False).last_hidden_state
 
     def head(self, hidden: torch.Tensor) -> torch.Tensor:
         """Logits of the next token, (..., V), from what the last layer knows, (..., D)."""
@@ -133,26 +135,32 @@ class LanguageModel(torch.nn.Module):
         """
         if not temperature >= 0:
             raise ValueError(f"temperature must be at least 0, got {temperature}")
-        input_ids, attention_mask = self.encode(prompts, side="left")
+        numbers = {prompt: number for number, prompt in enumerate(dict.fromkeys(prompts))}
+        rows = torch.tensor([numbers[prompt] for prompt in prompts], device=self.device)
+        different = self.encode(list(numbers), side="left")  # a prompt that is asked many times is read once
+        input_ids, attention_mask = different.input_ids[rows], different.attention_mask[rows]
         start = input_ids.shape[1]
         if start + max_new_tokens > self.context:
             raise ValueError(
                 f"max_new_tokens must leave room for the longest prompt, {start} of {self.context} tokens, got {max_new_tokens}"
             )
         alive = torch.ones(len(input_ids), dtype=torch.bool, device=self.device)
-        cache = None
+        inputs, cache = _inputs(*different), None
         for _ in range(max_new_tokens):
-            inputs = _inputs(input_ids, attention_mask)
-            if cache is not None:  # all but the newest token have been read
-                inputs |= {name: inputs[name][:, -1:] for name in ("input_ids", "position_ids")}
             output = self.network(**inputs, past_key_values=cache, use_cache=True, logits_to_keep=1)
+            logits = output.logits[:, -1]
+            if cache is None:  # now each prompt goes on as often as it was asked
+                output.past_key_values.batch_select_indices(rows)
+                logits = logits[rows]
             cache = output.past_key_values
-            drawn = torch.where(alive, _sample(output.logits[:, -1], temperature, generator), self.end_id)
+            drawn = torch.where(alive, _sample(logits, temperature, generator), self.end_id)
             input_ids = torch.cat([input_ids, drawn[:, None]], dim=1)
             attention_mask = torch.cat([attention_mask, alive[:, None]], dim=1)
             alive = alive & (drawn != self.end_id)
             if not alive.any():
                 break
+            inputs = _inputs(input_ids, attention_mask)
+            inputs |= {name: inputs[name][:, -1:] for name in ("input_ids", "position_ids")}  # the cache has read the others
         texts = self.decode(input_ids[:, start:], attention_mask[:, start:])
         return Samples(input_ids, attention_mask, torch.full((len(input_ids),), start, device=self.device), texts)
 

@@ -148,7 +148,9 @@ class Learner:
         return self.model.generate(prompts, max_new_tokens, generator=generator)
 
     def logits(self, input_ids: torch.Tensor, attention_mask: torch.Tensor) -> torch.Tensor:
-        return self.model.logits(input_ids, attention_mask)
+        """Logits of the next token at every position, (B, L, V); what they are at padding means nothing."""
+        nothing_before = attention_mask[:, 0].all()  # then no mask is needed: no kept token looks at the padding behind it
+        return self.model.logits(input_ids, attention_mask | nothing_before)
 
     def step(self, loss: torch.Tensor, max_grad_norm: float) -> None:
         """One step down the gradient of a loss, which is shortened to this norm if it is longer."""

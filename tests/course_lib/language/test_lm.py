@@ -124,6 +124,17 @@ def test_cached_generation_takes_the_tokens_that_whole_passes_would(model):
     assert torch.equal(samples.input_ids[:, start:][kept], likeliest[:, start - 1 : -1][kept])
 
 
+def test_a_prompt_asked_many_times_is_read_once_and_each_answer_has_its_place(model):
+    asked = ["The film is", "", "The film is", "A story that", "", "The film is"]
+    read = []
+    with model.network.register_forward_pre_hook(lambda _, __, inputs: read.append(inputs["input_ids"].shape), with_kwargs=True):
+        together = model.generate(asked, max_new_tokens=6, temperature=0)
+    width = int(together.prompt_lengths[0])
+    assert read[0] == (3, width) and set(read[1:]) == {(6, 1)}
+    assert together.texts == [model.generate([prompt], max_new_tokens=6, temperature=0).texts[0] for prompt in asked]
+    assert model.decode(together.input_ids[:, :width], together.attention_mask[:, :width]) == asked
+
+
 def test_samples_follow_the_models_distribution(model):
     drawn = model.generate(["The film is"] * 2000, max_new_tokens=1, generator=torch.Generator().manual_seed(0))
     tokens = model.encode(["The film is"])
