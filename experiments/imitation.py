@@ -6,10 +6,14 @@ first weights and the minibatches. "demonstrations" keeps ten flights of the exp
 
 "dagger" and "more" have one budget of labelled steps: those of `base` demonstrations, and as many again as the clone of these flies in
 `extra_flights`. The expert labels them on the clone's own way ("dagger"), or shows them on its own ("more").
+
+"pushed" flies the expert and clones of some demonstrations alike, with a side engine at full power for some steps whatever they command:
+a row for each length of the push, start and side, with the return of each.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,6 +40,7 @@ VARIANTS: dict[str, dict] = {
     "demonstrations": {"episodes": 10, "seed": 0},
     **{f"clone_{count}": {"demonstrations": count, **TRAINING, **EVALUATION} for count in COUNTS},
     **{name: {"base": 1, "extra_flights": 1, **TRAINING, **EVALUATION} for name in ("more", "dagger")},
+    "pushed": {"demonstrations": [1, 5, 20], "lengths": list(range(0, 21, 2)), "begin": 50, "starts": 6, **TRAINING},
 }
 SEEDS = dict.fromkeys(VARIANTS, 5) | {"demonstrations": 1}
 
@@ -72,6 +77,8 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
         return Result(_steps(shown), {"returns": shown.returns.tolist()}, _filmed(teacher))
 
     first_seed = 1000 * (seed + 1)
+    if variant == "pushed":
+        return Result(_pushed(settings, teacher, env, first_seed, seed, report))
     shown = collect_demonstrations(teacher, env, settings.get("base") or settings["demonstrations"], first_seed)
     obs, actions = shown.obs, shown.actions
     report(1, 4)
@@ -99,6 +106,33 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
     }
     rows = [{"step": step} | _drift(right, flown, step, clone.act, teacher) for step in SLICES]
     return Result(rows, summary, _filmed(clone.act) if seed == 0 else {})
+
+
+def _pushed(settings: dict, teacher: Policy, env: gym.Env, first_seed: int, seed: int, report: Report) -> list[dict]:
+    """The returns of all flights that are pushed, of the expert and of a clone for each number of demonstrations."""
+    flying = {"expert": teacher}
+    for count in settings["demonstrations"]:
+        shown = collect_demonstrations(teacher, env, count, first_seed)
+        flying[f"clone_{count}"] = fit(shown.obs, shown.actions, settings, seed)[0].act
+    rows = []
+    for done, length in enumerate(settings["lengths"], 1):
+        for start in range(settings["starts"]):
+            for side in (-1.0, 1.0):
+                row: dict = {"push": length, "start": start, "side": side}
+                for name, policy in flying.items():
+                    disturbed = _disturbed(policy, side, settings["begin"], length)
+                    returns = collect_demonstrations(disturbed, env, 1, EVALUATION["evaluation_seed"] + start).returns
+                    row[name] = returns.item()
+                rows.append(row)
+        report(done, len(settings["lengths"]))
+    return rows
+
+
+def _disturbed(policy: Policy, side: float, begin: int, length: int) -> Policy:
+    """The policy for one flight, but for some steps of a full side engine with the main engine off."""
+    steps = itertools.count()
+    push = torch.tensor([[0.0, side]])
+    return lambda obs: push if begin <= next(steps) < begin + length else policy(obs)
 
 
 def _drift(right: Demonstrations, flown: Demonstrations, step: int, clone: Policy, teacher: Policy) -> dict[str, float]:
