@@ -41,8 +41,12 @@ VARIANTS: dict[str, dict] = {
         for rule in ("random", "disagreement")
         for person, noise in (("", NOISE["unsure"]), ("_sure", NOISE["sure"]))
     },
+    "pendulum_models": {"task": "pendulum", "models": [[count, noise] for noise in NOISE for count in COMPARISONS[1:]]},
+    "cruise_models": {"task": "cruise", "models": [[100, "unsure"]]},
 }
-SEEDS = 5
+# five seeds do not draw a curve against the number of comparisons
+TWICE = [name for name, choice in VARIANTS.items() if choice["task"] != "cruise" and "queries" not in choice]
+SEEDS = dict.fromkeys(VARIANTS, 5) | dict.fromkeys(TWICE, 10)
 
 SETTINGS = {
     "cartpole": PPOSettings(
@@ -210,6 +214,37 @@ def correlation(x, y):
     return (x @ y).item() / norm if norm > 0 else math.nan
 
 
+def fitted(pool, comparisons, noise, task, seed):
+    """The reward model that `run` fits in its first round. Returns: (model, share of the answers that are mistakes, losses)."""
+    chosen, rejected, mistakes = ask(pool, comparisons, noise, seed)
+    model = clips.RewardModel(pool.obs.shape[-1], 0 if task == "cruise" else pool.actions.shape[-1], seed=seed).scale_to(pool)
+    return model, mistakes, clips.fit(model, chosen, rejected, preference_loss, seed=seed)
+
+
+def reward_tables(choice, policy, seed, report):
+    """What the models of `run` give, as PPO gets it, wherever one could be: a row for each state of a grid and each action, with a
+    column for each model and one for the true reward. No policy is trained.
+    """
+    task = choice["task"]
+    if task == "cruise":  # a step is judged by the speed that it leads to
+        speeds = torch.linspace(0, 3, 61)
+        columns = {"speed": speeds, "true": tasks.CruiseVectorEnv.passenger(speeds)}
+        obs = actions = speeds[:, None]
+    else:
+        grid = torch.cartesian_prod(torch.arange(-8, 8) * math.pi / 8, torch.arange(-8.0, 9.0, 2.0), torch.arange(-2.0, 3.0))
+        angle, velocity, torque = grid.T
+        truth = -(angle**2 + 0.1 * velocity**2 + 0.001 * torque**2)
+        columns = {"angle": angle, "velocity": velocity, "torque": torque, "true": truth}
+        obs, actions = torch.stack([angle.cos(), angle.sin(), velocity], dim=1), torque[:, None]
+    pool = collect_clips(task, policy, POOL, seed)
+    for done, (count, person) in enumerate(choice["models"], 1):
+        model, *_ = fitted(pool, count, NOISE[person], task, seed)
+        columns[f"{count}_{person}"] = frozen_reward(task, model, pool)(obs, actions, obs)
+        report(done, len(choice["models"]))
+    names = list(columns)
+    return [dict(zip(names, row, strict=True)) for row in torch.stack(list(columns.values()), dim=1).tolist()]
+
+
 def frozen_reward(task, model, pool):
     """The learned reward as PPO gets it, `reward(obs, actions, next_obs) -> (T, N)`, on a scale fixed by the clips.
 
@@ -276,6 +311,9 @@ def run(variant, seed, checkpoint_dir, report):
         if task == "cruise":
             summary["kl"] = log_ratios(policy, reference, rollout.obs, rollout.actions).mean().item()
             summary["speed"] = rollout.next_obs.mean().item()
+
+    if "models" in choice:
+        return Result(reward_tables(choice, policy, seed, report))
 
     if choice["comparisons"] is None:
         train(0, None)
