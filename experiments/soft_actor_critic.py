@@ -57,7 +57,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     variant: {"environment": ENVIRONMENT, "every": EVERY} | asdict(REFERENCE) | OURS | changes
     for variant, changes in CHANGES.items()
 }
-FEWER = {variant: 5 for variant in CHANGES if variant.startswith("rewards")}
+FEWER = {variant: 3 for variant in CHANGES if variant.startswith("rewards")}
 FEWER |= {"ratio_5": 3, "one_critic_5": 3, "redq_5": 3, "lab_suspect": 5}  # runs of the first three take a minute of a core each
 SEEDS = {variant: FEWER.get(variant, 10) for variant in CHANGES}
 TAUGHT = sac.Taught.of(vars(ch47))
