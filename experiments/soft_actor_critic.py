@@ -1,8 +1,8 @@
 """SAC on Pendulum with one part taken away or changed, and what its critics believe beside what their actions bring.
 
 A variant is `reference`, the setting `sac` of experiments/sensitivity.py, or the same with one change: a single critic is asked, the
-temperature is fixed, the slow copies are copied at once, the buffer forgets; rewards are multiplied by a number, with the thermostat and
-with a temperature fixed where that begins, at 1. `ratio_5` makes five updates after each step, `one_critic_5`
+temperature is fixed, the slow copies are copied at once, the buffer forgets; rewards are multiplied by a number.
+`ratio_5` makes five updates after each step, `one_critic_5`
 does so with a single critic, and `redq_5` is the sibling that is made for it, of Chen et al. (2021), algorithm 1,
 https://arxiv.org/abs/2101.05982: ten critics, of which two drawn at random make a target, and one step of the policy, against the mean of
 all ten, after five of the critics.
@@ -50,7 +50,6 @@ CHANGES: dict[str, dict[str, Any]] = {
     "redq_5": {"updates": 5, "asked": "mean of ten"},
     "lab_suspect": {"follow": "by masks"},
     **{f"rewards_{scale:g}": {"reward_scale": scale} for scale in SCALES},
-    **{f"rewards_{scale:g}_alpha_1": {"reward_scale": scale, "initial_alpha": 1.0, "adapts": False} for scale in SCALES},
 }
 OURS = {"asked": "smaller of two", "adapts": True, "updates": 1}  # what SACSettings does not have
 VARIANTS: dict[str, dict[str, Any]] = {
