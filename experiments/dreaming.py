@@ -1,7 +1,8 @@
 """A small Dreamer on Pendulum: an actor that learns by gradients through a learned ensemble, along dreams of ten steps.
 
 The program of chapter 51's last experiment on Pendulum, evaluated as all agents of `control` are. "lam_0" asks the critic after each
-dreamt step, where "dreamer" waits longer. One update for each real step; rows are evaluations.
+dreamt step, where "dreamer" waits longer; "pulled" adds to the policy's loss a little of its squared pre-activations, so that its tanh
+does not saturate. One update for each real step; rows are evaluations.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ DREAMER: dict[str, Any] = {
     "refresh_every": 100, "batch_size": 64, "horizon": 10, "gamma": 0.95, "lam": 0.95, "reward_scale": 0.1, "tau": 0.02,
     "actor_learning_rate": 1e-3, "critic_learning_rate": 3e-3, "noise": 0.3,
 }  # fmt: skip
-VARIANTS: dict[str, dict[str, Any]] = {"dreamer": DREAMER, "lam_0": DREAMER | {"lam": 0.0}}
-SEEDS = {"dreamer": 8, "lam_0": 4}
+VARIANTS: dict[str, dict[str, Any]] = {"dreamer": DREAMER, "lam_0": DREAMER | {"lam": 0.0}, "pulled": DREAMER | {"pull": 0.01}}
+SEEDS = {"dreamer": 8, "lam_0": 4, "pulled": 8}
 
 
 def differentiable(model):
@@ -53,8 +54,8 @@ def value(critic, obs):
 class Dreamer:
     """A policy and a critic that learn from nothing but dreams."""
 
-    def __init__(self, seed, lam=0.95):
-        generator, self.lam = torch.Generator().manual_seed(seed), lam
+    def __init__(self, seed, lam=0.95, pull=0.0):
+        generator, self.lam, self.pull = torch.Generator().manual_seed(seed), lam, pull
         self.actor = Networks((3, 64, 64, 1), generator=generator)
         self.critic = Networks((3, 64, 64, 1), generator=generator)
         self.slow = self.critic.frozen_copy()
@@ -69,17 +70,21 @@ class Dreamer:
         values = value(self.slow, dream["obs"][1:])
         rewards, continues = 0.1 * dream["rewards"], dream["continues"]
         returns = dreamer_lambda_returns(rewards, values, continues, 0.95, self.lam)
-        minimise(-returns.mean(), self.of_actor)
+        loss = -returns.mean()
+        if self.pull:
+            seen = dream["obs"][:-1].detach().flatten(0, 1)
+            loss = loss + self.pull * self.actor(seen)[0].square().mean()
+        minimise(loss, self.of_actor)
         guesses = value(self.critic, dream["obs"][:-1].detach())
         minimise((guesses - returns.detach()).square().mean(), self.of_critic)
         self.slow.weights.lerp_(self.critic.weights.detach(), 0.02)
 
 
-def dreaming(seed, steps=1000, lam=0.95):
+def dreaming(seed, steps=1000, lam=0.95, pull=0.0):
     """After every 100 steps in the world: how many there were, and the agent."""
     env, generator = gym.make("Pendulum-v1"), torch.Generator().manual_seed(seed)
     model = mbpo.Ensemble(3, 1, mbpo.MBPOSettings(), gaussian_nll, seed=seed)
-    agent, buffer = Dreamer(seed, lam), ReplayBuffer(steps, 3, 1)
+    agent, buffer = Dreamer(seed, lam, pull), ReplayBuffer(steps, 3, 1)
     for step in range(1, steps + 1):
         if step % 200 == 1:
             obs, _ = env.reset(seed=seed if step == 1 else None)
@@ -104,7 +109,7 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
     settings, rows, spent = VARIANTS[variant], [], 0.0
     began = time.process_time()
     final: list[float] = []
-    for steps, agent in dreaming(seed, settings["steps"], settings["lam"]):
+    for steps, agent in dreaming(seed, settings["steps"], settings["lam"], settings.get("pull", 0.0)):
         spent += time.process_time() - began
         final = evaluate(lambda obs, act=agent.act: 2 * act(torch.as_tensor(obs)).detach(), ENVIRONMENT)
         rows.append({"env_steps": steps, "train_cpu_seconds": spent, "eval_return": float(np.mean(final))})

@@ -3,7 +3,8 @@
 The program of chapter 51's first experiment, for more seeds than a page has time for. The first episode is random; each later one is
 planned with a model of everything before it. Rows are horizons: `error_200`, `mean_200`, … are what `model_error_by_horizon` finds,
 on the last episode, of the models of 200, 400 and 600 steps as they draw and of their expectation, and `still` the error of
-predicting that nothing moves. The summary has the return of each episode.
+predicting that nothing moves. The summary has the return of each episode. `plan_40_held` has five pieces of a plan as `swing_up` does,
+each held for longer; `capped` expects no reward above the highest that it has earned.
 """
 
 from __future__ import annotations
@@ -28,17 +29,20 @@ PLANNER = {"candidates": 100, "pieces": 5, "hold": 4}
 EPISODES, STEPS, CARRIED_OUT = 4, 200, 2
 HORIZON, APART = 50, 10  # steps of a piece of the last episode, and between the starts of two
 
+CHANGES: dict[str, dict[str, Any]] = {
+    "swing_up": {},
+    **{f"plan_{pieces * PLANNER['hold']}": {"pieces": pieces} for pieces in (1, 2, 3, 10)},
+    "plan_40_held": {"hold": 8},
+    "capped": {"capped": True},
+}
 VARIANTS: dict[str, dict[str, Any]] = {
     variant: {"environment": ENVIRONMENT, "episodes": EPISODES, "steps": STEPS, "carried_out": CARRIED_OUT}
     | PLANNER
     | change
     | {name: getattr(SETTINGS, name) for name in OF_THE_MODEL}
-    for variant, change in {
-        "swing_up": {},
-        **{f"plan_{pieces * PLANNER['hold']}": {"pieces": pieces} for pieces in (1, 2, 3, 10)},
-    }.items()
+    for variant, change in CHANGES.items()
 }
-SEEDS = dict.fromkeys(VARIANTS, 6) | {"swing_up": 10}
+SEEDS = dict.fromkeys(VARIANTS, 6) | {"swing_up": 10, "capped": 10}
 
 
 def best_plan(model, obs, generator, candidates, pieces, hold):
@@ -50,17 +54,34 @@ def best_plan(model, obs, generator, candidates, pieces, hold):
     return plans[:, dream["rewards"].sum(0).argmax()]
 
 
-def swing_up(seed: int, report: Report, planner: Mapping[str, int] = PLANNER, episodes: int = EPISODES, steps: int = STEPS):
+def capped(model, highest: float):
+    """The model, but for rewards above `highest`, which it does not expect."""
+
+    def step(obs, actions, generator):
+        next_obs, rewards, continues = model(obs, actions, generator)
+        return next_obs, rewards.clamp(max=highest), continues
+
+    return step
+
+
+def swing_up(
+    seed: int,
+    report: Report,
+    planner: Mapping[str, int] = PLANNER,
+    episodes: int = EPISODES,
+    steps: int = STEPS,
+    cap: bool = False,
+):
     """Returns of each episode, the model after each but the last, and all steps."""
     env, generator = gym.make(ENVIRONMENT), torch.Generator().manual_seed(seed)
     model = mbpo.Ensemble(3, 1, SETTINGS, gaussian_nll, seed=seed)
-    buffer, returns, models = ReplayBuffer(steps * episodes, 3, 1), [], []
+    buffer, returns, models, highest = ReplayBuffer(steps * episodes, 3, 1), [], [], 0.0
     for episode in range(episodes):
         obs, _ = env.reset(seed=seed if episode == 0 else None)
         returns.append(0.0)
         for step in range(steps):
             if episode and step % CARRIED_OUT == 0:
-                plan = best_plan(model, obs, generator, **planner)
+                plan = best_plan(capped(model, highest) if cap else model, obs, generator, **planner)
             action = plan[step % CARRIED_OUT] if episode else 2 * torch.rand(1, generator=generator) - 1
             next_obs, reward, terminated, _, _ = env.step(2 * action.numpy())
             buffer.add(obs[None], action[None], [reward], next_obs[None], [terminated])
@@ -68,6 +89,7 @@ def swing_up(seed: int, report: Report, planner: Mapping[str, int] = PLANNER, ep
         if episode < episodes - 1:
             model.fit(buffer[torch.arange(len(buffer))], generator)
             models.append(copy.deepcopy(model))
+            highest = buffer[torch.arange(len(buffer))].rewards.max().item()
         report(episode + 1, episodes)
     return returns, models, buffer[torch.arange(len(buffer))]
 
@@ -102,7 +124,8 @@ def promised(model: mbpo.Ensemble) -> float:
 def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result:
     """Swing up once, and measure the models; it takes seconds, so that no checkpoint is kept."""
     planner = {name: VARIANTS[variant][name] for name in PLANNER}
-    returns, models, everything = swing_up(seed, report, planner)
+    cap = {"cap": True} if VARIANTS[variant].get("capped") else {}
+    returns, models, everything = swing_up(seed, report, planner, **cap)
     real, taken = pieces_of(*episode_of(everything))
     columns = {"still": (real[1:] - real[0]).square().mean((1, 2)).sqrt()}
     for i, model in enumerate(models, start=1):

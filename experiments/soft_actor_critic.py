@@ -1,10 +1,10 @@
 """SAC on Pendulum with one part taken away or changed, and what its critics believe beside what their actions bring.
 
 A variant is `reference`, the setting `sac` of experiments/sensitivity.py, or the same with one change: a single critic is asked, the
-temperature is fixed, the slow copies are copied at once, the buffer forgets. `ratio_5` makes five updates after each step, `one_critic_5`
-does so with a single critic, and `redq_5` is the sibling that is made for it, of Chen et al. (2021), algorithm 1,
-https://arxiv.org/abs/2101.05982: ten critics, of which two drawn at random make a target, and one step of the policy, against the mean of
-all ten, after five of the critics.
+temperature is fixed, the slow copies are copied at once, the buffer forgets; rewards are multiplied by a number. `ratio_5` makes five
+updates after each step, `one_critic_5` does so with a single critic, and `redq_5` is the sibling that is made for it, of Chen et al.
+(2021), algorithm 1, https://arxiv.org/abs/2101.05982: ten critics, of which two drawn at random make a target, and one step of the policy,
+against the mean of all ten, after five of the critics.
 
 Policies are evaluated as in experiments/control.py. Beside that, each evaluation plays ten episodes with the policy's own noise:
 `predicted` is what the critics say of the first hundred actions of each, as the policy is told it, and `realised` the discounted soft
@@ -34,6 +34,7 @@ ENVIRONMENT, EVERY = "Pendulum-v1", 250  # environment steps between evaluations
 STEPS, JUDGED = 200, 100  # of an episode, and how many of its actions are judged: later ones have too little future left
 CRITICS = 10  # of REDQ
 
+SCALES = (0.01, 0.1, 10.0, 100.0)
 CHANGES: dict[str, dict[str, Any]] = {
     "reference": {},
     "one_critic": {"asked": "first"},
@@ -47,13 +48,15 @@ CHANGES: dict[str, dict[str, Any]] = {
     "one_critic_5": {"updates": 5, "asked": "first"},
     "redq_5": {"updates": 5, "asked": "mean of ten"},
     "lab_suspect": {"follow": "by masks"},
+    **{f"rewards_{scale:g}": {"reward_scale": scale} for scale in SCALES},
 }
 OURS = {"asked": "smaller of two", "adapts": True, "updates": 1}  # what SACSettings does not have
 VARIANTS: dict[str, dict[str, Any]] = {
     variant: {"environment": ENVIRONMENT, "every": EVERY} | asdict(REFERENCE) | OURS | changes
     for variant, changes in CHANGES.items()
 }
-FEWER = {"ratio_5": 3, "one_critic_5": 3, "redq_5": 3, "lab_suspect": 5}  # runs of the first three take a minute of a core each
+FEWER = {variant: 3 for variant in CHANGES if variant.startswith("rewards")}
+FEWER |= {"ratio_5": 3, "one_critic_5": 3, "redq_5": 3, "lab_suspect": 5}  # runs of the first three take a minute of a core each
 SEEDS = {variant: FEWER.get(variant, 10) for variant in CHANGES}
 TAUGHT = sac.Taught.of(vars(ch47))
 
@@ -148,12 +151,18 @@ class REDQ(Several):
         return {"critic_loss": critic_loss} | policy_update(self.agent, batch, self.generator)
 
 
+def world(scale: float) -> gym.Env:
+    """The environment, its rewards multiplied."""
+    env = gym.make(ENVIRONMENT)
+    return env if scale == 1 else gym.wrappers.TransformReward(env, lambda reward: scale * float(reward))
+
+
 def made(variant: str, seed: int) -> tuple[sac.Training, Callable]:
     """A variant's training, and what its policy is told of the values of several critics, (critics, B) -> (B,)."""
     changes: dict[str, Any] = OURS | CHANGES[variant]
     chosen = {field.name for field in fields(REFERENCE)}
     settings = REFERENCE.but(**{name: value for name, value in CHANGES[variant].items() if name in chosen})
-    env = gym.make(ENVIRONMENT)
+    env = world(changes.get("reward_scale", 1.0))
     if changes["asked"] == "mean of ten":
         return REDQ(env, settings, seed, TAUGHT), lambda q: q.mean(0)
     kind = Several if changes["updates"] > 1 else sac.Training
@@ -168,10 +177,10 @@ def made(variant: str, seed: int) -> tuple[sac.Training, Callable]:
 
 
 @torch.no_grad()
-def beliefs(agent: sac.Agent, told: Callable, gamma: float) -> dict[str, float]:
+def beliefs(agent: sac.Agent, told: Callable, gamma: float, scale: float = 1.0) -> dict[str, float]:
     """Of the policy's own actions: what the critics predict, and the discounted soft return that follows."""
     generator = torch.Generator().manual_seed(EVALUATION_SEED)
-    stages = [gym.make(ENVIRONMENT) for _ in range(EPISODES)]
+    stages = [world(scale) for _ in range(EPISODES)]
     obs = np.stack([stage.reset(seed=EVALUATION_SEED + i)[0] for i, stage in enumerate(stages)])
     predicted, rewards, log_probs = [], [], []
     for _ in range(STEPS):
@@ -193,6 +202,7 @@ def beliefs(agent: sac.Agent, told: Callable, gamma: float) -> dict[str, float]:
 def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result:
     """Train one agent and evaluate it on the way; it takes seconds, so that no checkpoint is kept."""
     training, told = made(variant, seed)
+    scale = CHANGES[variant].get("reward_scale", 1.0)
     rows: list[dict[str, Any]] = []
     spent = 0.0
     while training.env_steps < training.settings.total_steps:
@@ -200,6 +210,6 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
         row: dict[str, Any] = training.advance(EVERY)
         spent += time.process_time() - begun
         row |= {"train_cpu_seconds": spent, "eval_return": float(np.mean(evaluate(training.agent.best_action, ENVIRONMENT)))}
-        rows.append(row | beliefs(training.agent, told, training.settings.gamma))
+        rows.append(row | beliefs(training.agent, told, training.settings.gamma, scale))
         report(training.env_steps, training.settings.total_steps)
     return Result(rows, {"final_return": rows[-1]["eval_return"]})

@@ -26,6 +26,7 @@ def test_the_configuration_says_what_the_program_does():
     }.items():
         assert written.format(dreaming.DREAMER[name]) in source, name
     assert dreaming.VARIANTS["lam_0"] == dreaming.DREAMER | {"lam": 0.0}
+    assert dreaming.VARIANTS["pulled"] == dreaming.DREAMER | {"pull": 0.01}
 
 
 def test_gradient_passes_through_the_world_and_not_to_its_weights():
@@ -57,13 +58,27 @@ def test_a_policy_learns_through_what_its_actions_bring_and_from_nothing_else():
 def test_rows_are_evaluations_and_a_variant_sets_lambda(tmp_path, monkeypatch):
     asked = []
 
-    def short(seed, steps, lam):
-        asked.append((seed, steps, lam))
+    def short(seed, steps, lam, pull):
+        asked.append((seed, steps, lam, pull))
         yield from ((100, dreaming.Dreamer(seed, lam)), (200, dreaming.Dreamer(seed, lam)))
 
     monkeypatch.setattr(dreaming, "dreaming", short)
     told = []
     result = dreaming.run("lam_0", 3, tmp_path, lambda done, total: told.append((done, total)))
-    assert asked == [(3, 1000, 0.0)] and told == [(100, 1000), (200, 1000)]
+    assert asked == [(3, 1000, 0.0, 0.0)] and told == [(100, 1000), (200, 1000)]
     assert [row["env_steps"] for row in result.rows] == [100, 200] and len(result.summary["final_returns"]) == 10
     assert all(row["eval_return"] < 0 for row in result.rows)
+
+
+def test_a_pull_keeps_the_policy_from_its_bounds():
+    def world(obs, actions, generator):
+        """All reward is for the action, and the more the better."""
+        return obs, actions[:, 0], torch.ones(len(obs))
+
+    starts, found = torch.randn(16, 3, generator=torch.Generator().manual_seed(1)), []
+    for pull in (0.0, 1.0):
+        agent = dreaming.Dreamer(0, pull=pull)
+        for _ in range(30):
+            agent.learn(world, starts, None)
+        found.append(agent.act(starts).mean().item())
+    assert found[1] < 0.5 * found[0]

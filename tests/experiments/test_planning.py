@@ -42,9 +42,10 @@ def test_rows_are_horizons_and_the_summary_has_each_return(tiny, tmp_path, monke
 
 def test_variants_change_how_far_is_planned_and_nothing_else(tiny, tmp_path, monkeypatch):
     lengths = {name: given["pieces"] * given["hold"] for name, given in planning.VARIANTS.items()}
-    assert lengths == {"swing_up": 20, "plan_4": 4, "plan_8": 8, "plan_12": 12, "plan_40": 40}
-    for given in planning.VARIANTS.values():
-        assert given | {"pieces": 5} == planning.VARIANTS["swing_up"]
+    far = {"plan_40": 40, "plan_40_held": 40}
+    assert lengths == {"swing_up": 20, "plan_4": 4, "plan_8": 8, "plan_12": 12, "capped": 20} | far
+    for name, given in planning.VARIANTS.items():
+        assert given | {"pieces": 5, "hold": 4} == planning.VARIANTS["swing_up"] | ({"capped": True} if name == "capped" else {})
     asked = []
 
     def best_plan(model, obs, generator, **planner):
@@ -54,3 +55,22 @@ def test_variants_change_how_far_is_planned_and_nothing_else(tiny, tmp_path, mon
     monkeypatch.setattr(planning, "best_plan", best_plan)
     planning.run("plan_40", 0, tmp_path, lambda done, total: None)
     assert asked == [{"candidates": 100, "pieces": 10, "hold": 4}] * 300
+
+
+def test_a_capped_planner_expects_no_reward_above_the_highest_that_it_has_earned(tiny, monkeypatch):
+    def promising(obs, actions, generator):
+        return obs, torch.tensor([-5.0, -1.0, 3.0]), torch.ones(3)
+
+    assert planning.capped(promising, -2.0)(None, None, None)[1].tolist() == [-5.0, -2.0, -2.0]
+    asked = []
+
+    def best_plan(model, obs, generator, **planner):
+        asked.append(model(torch.as_tensor(obs)[None], torch.zeros(1, 1), generator)[1].item())
+        return torch.zeros(planning.CARRIED_OUT, 1)
+
+    monkeypatch.setattr(planning, "best_plan", best_plan)
+    monkeypatch.setattr(
+        planning.mbpo.Ensemble, "__call__", lambda self, obs, actions, generator: (obs, torch.ones(1), torch.ones(1))
+    )
+    _, _, everything = planning.swing_up(0, lambda done, total: None, episodes=2, cap=True)
+    assert set(asked) == {everything.rewards[:200].max().item()}
