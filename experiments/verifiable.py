@@ -27,7 +27,7 @@ from solutions.ch101 import grpo_iteration, pass_at_k, verify_sorted
 WEAK, STRONG = 100, 300  # steps of supervised learning before
 COMMON = {"method": "grpo", "warm_up": WEAK, "iterations": 90, "digits": [5], "room": 8, "prompts": 24, "group_size": 8}
 MIXED = COMMON | {"digits": [3, 3, 3, 7], "room": 10, "warm_up": 150, "iterations": 60}
-LONG = COMMON | {"room": 24, "iterations": 60, "scale": "none"}
+LONG = COMMON | {"room": 24, "iterations": 30, "rows": 5, "scale": "none"}
 PASSES = COMMON | {"epochs": 4, "iterations": 30, "rows": 5, "watched": True}
 PRICE = 1e-3  # of a character, in the silent bug
 VARIANTS: dict[str, dict] = {
