@@ -48,7 +48,6 @@ VARIANTS: dict[str, dict] = {
     "clip_both": PASSES | {"clip_low": 0.2, "clip_high": 0.2},
     "clip_higher": PASSES | {"clip_low": 0.2, "clip_high": 0.28},
     "clip_tight": PASSES | {"clip_low": 0.2, "clip_high": 0.02},
-    "clip_below": PASSES | {"clip_low": 0.2, "clip_high": 1e6},  # no bound above
     "clip_above": PASSES | {"clip_low": 1e6, "clip_high": 0.28},  # no bound below
     **{f"digits_{n}": COMMON | {"digits": [n], "room": n + 3, "iterations": 0} for n in (4, 5, 6, 7)},
 }
