@@ -1,8 +1,9 @@
 """GRPO on sorting digits with a model of 100,000 parameters, and what may stand in its place (chapter 101).
 
-Baselines, a critic, supervised learning, difficulty, a verifier with a hole and a silent bug. A run's seed is that of the model, of its
-warm-up and of training. Every iteration of every variant asks the verifier about 192 answers; a row stands for ten iterations. In some
-of them the policy is measured on prompts whose answers were never asked for in training.
+Baselines, a critic, supervised learning, difficulty, a verifier with a hole, a silent bug, room for long answers, and bounds on the ratio
+with the entropy that is left. A run's seed is that of the model, of its warm-up and of training. Every iteration of every variant asks
+the verifier about 192 answers; a row stands for ten iterations unless "rows" says otherwise. In some of them the policy is measured on
+prompts whose answers were never asked for in training.
 """
 
 from __future__ import annotations
@@ -26,12 +27,15 @@ from solutions.ch101 import grpo_iteration, pass_at_k, verify_sorted
 WEAK, STRONG = 100, 300  # steps of supervised learning before
 COMMON = {"method": "grpo", "warm_up": WEAK, "iterations": 90, "digits": [5], "room": 8, "prompts": 24, "group_size": 8}
 MIXED = COMMON | {"digits": [3, 3, 3, 7], "room": 10, "warm_up": 150, "iterations": 60}
+LONG = COMMON | {"room": 24, "iterations": 30, "rows": 5, "scale": "none"}
+PASSES = COMMON | {"epochs": 4, "iterations": 30, "rows": 5, "watched": True}
 PRICE = 1e-3  # of a character, in the silent bug
 VARIANTS: dict[str, dict] = {
     "grpo": COMMON,
     "rloo": COMMON | {"baseline": "leave_one_out", "scale": "none"},
     "dr_grpo": COMMON | {"scale": "none", "how": "constant"},
     "ppo": COMMON | {"method": "ppo"},
+    "no_critic": COMMON | {"method": "no_critic"},
     "supervised": COMMON | {"method": "supervised"},
     "rejection": COMMON | {"method": "rejection"},
     "lab_suspect": MIXED | {"price": PRICE},
@@ -40,11 +44,16 @@ VARIANTS: dict[str, dict] = {
     "strong": COMMON | {"warm_up": STRONG},
     "hole": COMMON | {"verifier": "ascending"},
     **{f"group_{size}": COMMON | {"prompts": 192 // size, "group_size": size} for size in (2, 4, 16, 32)},
+    **{f"long_{how}": LONG | {"how": how} for how in ("sequences", "tokens", "constant")},
+    "clip_both": PASSES | {"clip_low": 0.2, "clip_high": 0.2},
+    "clip_higher": PASSES | {"clip_low": 0.2, "clip_high": 0.28},
+    "clip_tight": PASSES | {"clip_low": 0.2, "clip_high": 0.02},
+    "clip_above": PASSES | {"clip_low": 1e6, "clip_high": 0.28},  # no bound below
     **{f"digits_{n}": COMMON | {"digits": [n], "room": n + 3, "iterations": 0} for n in (4, 5, 6, 7)},
 }
 SEEDS = 5
 ROWS, LOOK = 10, 30  # iterations that a row stands for, and between two measurements
-SETTINGS = ("prompts", "group_size", "baseline", "scale", "how")
+SETTINGS = ("prompts", "group_size", "baseline", "scale", "how", "epochs", "clip_low", "clip_high")
 
 
 def ascending(prompts: list[str], completions: list[str]) -> torch.Tensor:
@@ -67,8 +76,25 @@ def started(choice: dict, seed: int) -> lm.LanguageModel:
     return policy
 
 
-def ppo(policy: lm.LanguageModel, seed: int, settings: GroupSettings) -> Callable:
-    """An iteration with a critic of the policy's size, as in chapter 95, on as many answers, each to a prompt of its own."""
+class Watched(Learner):
+    """A learner that notes the mean entropy of its next token, in nats, over all tokens that it has just written."""
+
+    entropy = float("nan")
+
+    def generate(self, prompts, max_new_tokens, generator=None):
+        samples = super().generate(prompts, max_new_tokens, generator)
+        with torch.no_grad():
+            logps = self.logits(samples.input_ids, samples.attention_mask)[:, :-1].log_softmax(-1)
+        mask = completion_mask(samples.input_ids, samples.prompt_lengths, self.end_id)[:, 1:]
+        self.entropy = masked_mean(-(logps.exp() * logps).sum(-1), mask).item()
+        return samples
+
+
+def ppo(policy: lm.LanguageModel, seed: int, settings: GroupSettings, with_critic: bool = True) -> Callable:
+    """An iteration with a critic of the policy's size, as in chapter 95, on as many answers, each to a prompt of its own.
+
+    Without the critic all values are 0, and what is left of the baseline is the mean of the batch.
+    """
     torch.manual_seed(seed)
     critic = Learner(lm.ValueModel(policy), 1e-3)
 
@@ -81,15 +107,16 @@ def ppo(policy: lm.LanguageModel, seed: int, settings: GroupSettings) -> Callabl
         rewards = scores[:, None] * (columns == torch.where(mask, columns, -1).amax(1, keepdim=True))
         with torch.no_grad():
             old_logps = per_token_logps(policy.logits(ids, attention), ids)
-            values = critic.model(ids, attention)[:, :-1]
+            values = critic.model(ids, attention)[:, :-1] if with_critic else torch.zeros_like(old_logps)
         advantages = masked_gae(rewards, values, mask, 1.0, 1.0)
         returns, advantages = advantages + values, masked_whiten(advantages, mask)
         for rows in minibatches(len(prompts), settings.minibatch, generator):
             logps = per_token_logps(policy.logits(ids[rows], attention[rows]), ids[rows])
             loss = ppo_token_loss(logps, old_logps[rows], advantages[rows], mask[rows])
-            errors = critic.model(ids[rows], attention[rows])[:, :-1] - returns[rows]
             policy.step(loss, settings.max_grad_norm)
-            critic.step(masked_mean(errors**2, mask[rows]), settings.max_grad_norm)
+            if with_critic:
+                errors = critic.model(ids[rows], attention[rows])[:, :-1] - returns[rows]
+                critic.step(masked_mean(errors**2, mask[rows]), settings.max_grad_norm)
         return {"reward": scores.mean().item()}
 
     return iteration
@@ -128,10 +155,11 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
     answers = settings.prompts * settings.group_size
     pays = ascending if choice.get("verifier") else priced(choice["price"]) if "price" in choice else verify_sorted
     iteration = {"grpo": grpo_iteration, "supervised": supervised, "rejection": rejection}.get(method) or ppo(
-        policy, seed, settings
+        policy, seed, settings, with_critic=method == "ppo"
     )
-    asks = answers if method in ("ppo", "supervised") else settings.prompts
-    learner = Learner(policy, settings.learning_rate)
+    asks = answers if method in ("ppo", "no_critic", "supervised") else settings.prompts
+    learner = (Watched if choice.get("watched") else Learner)(policy, settings.learning_rate)
+    span = choice.get("rows", ROWS)
     generator = seed_everything(100 + seed)
     seen: list[dict[str, float]] = []
 
@@ -140,9 +168,11 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
         sizes = torch.tensor([len(prompt) - 1 for prompt in prompts])
         lengths = torch.tensor([float(len(text)) for text in completions])
         kinds = {"_few": sizes == min(digits), "_many": sizes == max(digits)} if len(digits) > 1 else {}
-        told = {"right": right, "characters": lengths}
+        told = {"right": right, "characters": lengths, "unended": (lengths >= room).float()}
+        of_wrong = {"characters_wrong": lengths[right < 0.5].mean().item()} if (right < 0.5).any() else {}
         seen.append(
             {name: part.mean().item() for name, part in told.items()}
+            | of_wrong
             | {name + kind: part[rows].mean().item() for name, part in told.items() for kind, rows in kinds.items() if rows.any()}
         )
         return rewards
@@ -170,10 +200,12 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
     for done in range(1, iterations + 1):
         begun = time.process_time()
         prompts = questions(asks, generator, digits)
-        logged.append(iteration(learner, prompts, verify, settings, generator))
+        logged.append(dict(iteration(learner, prompts, verify, settings, generator)))
+        if isinstance(learner, Watched):
+            logged[-1]["entropy"] = learner.entropy
         seconds += time.process_time() - begun
-        if done % ROWS == 0:
-            recent = [one | two for one, two in zip(logged[-ROWS:], seen[-ROWS:] or [{}] * ROWS, strict=True)]
+        if done % span == 0:
+            recent = [one | two for one, two in zip(logged[-span:], seen[-span:] or [{}] * span, strict=True)]
             means = {
                 name: float(np.mean([one[name] for one in recent if name in one])) for name in {n for one in recent for n in one}
             }

@@ -85,7 +85,7 @@ VERIFY_SORTED = Exercise(
             closed_form=number(0, 0, 0, 0, 1),
             visible=True,
         ),
-        Case("a leading zero lost", _strings(("210=", "12"), ("210=", "012")), closed_form=number(0, 1)),
+        Case("a leading zero lost", _strings(("210=", "12"), ("210=", "012")), closed_form=number(0, 1), visible=True),
         Case("digits of another script", _strings(("21=", "١٢"), ("21=", "12")), closed_form=number(0, 1)),
         Case("the prompt given back", _strings(("12=", "12="), ("21=", "21=")), closed_form=number(0, 0)),
         Case("one completion too few", _strings(("21=", "12"), ("31=", "13")), closed_form=number(1, 1)),
@@ -454,6 +454,18 @@ GROUP_ADVANTAGES = Exercise(
                 "batch-for-group": (
                     _advantages(own=lambda r, e: r.std(correction=0) + e),
                     "With group each group has a deviation of its own.",
+                ),
+                "group-for-batch-unbiased": (
+                    _advantages(**_CORRECTED | {"whole": lambda r, e: r.std(1, keepdim=True) + e}),
+                    "With batch the deviation is one number, of all rewards, and not of each group.",
+                ),
+                "batch-for-group-unbiased": (
+                    _advantages(**_CORRECTED | {"own": lambda r, e: r.std() + e}),
+                    "With group each group has a deviation of its own.",
+                ),
+                "variance-divides-unbiased": (
+                    _advantages(own=lambda r, e: r.var(1, keepdim=True) + e, whole=lambda r, e: r.var() + e),
+                    "The variance divides where its root should: advantages would have the unit 1 / reward.",
                 ),
                 "variance-divides": (
                     _advantages(
@@ -870,6 +882,14 @@ GRPO_LOSS = Exercise(
                     _loss(
                         bounded=lambda q, w, lo, hi: torch.minimum(q * w, q.clamp(1 - hi, 1 + lo) * w),
                         low=lambda q, w, lo: (q < 1 - 0.28) & (w < 0) if lo == 0.2 else (q < 1 - lo) & (w < 0),
+                    ),
+                    "clip_low goes below 1, clip_high above.",
+                ),
+                "bounds-swapped-in-the-shares-too": (
+                    _loss(
+                        bounded=lambda q, w, lo, hi: torch.minimum(q * w, q.clamp(1 - hi, 1 + lo) * w),
+                        low=lambda q, w, lo: (q < 1 - (0.28 if lo == 0.2 else lo)) & (w < 0),
+                        high=lambda q, w, hi: (q > 1 + (0.2 if hi == 0.28 else hi)) & (w > 0),
                     ),
                     "clip_low goes below 1, clip_high above.",
                 ),

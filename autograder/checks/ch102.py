@@ -437,6 +437,10 @@ _WRONG_DIAGNOSES = {
         _told(lambda logged, computed: (logged - computed).abs() <= 0.03),
         "Numbers that are a hundredth apart come from different rules: the tolerance is 1e-5, for rounding alone.",
     ),
+    "tolerance-not-scaled": (
+        _told(lambda logged, computed: (logged - computed).abs() <= 1e-5),
+        "Rounding grows with the numbers: where what was logged is above 1, the tolerance is 1e-5 times that.",
+    ),
     "k1-and-k3-swapped": (_told(order=(1, 0, 2, 3)), "k1 comes first, the mean of -log ρ, and k3 second."),
     "fractions-swapped": (_told(order=(0, 1, 3, 2)), "“outside” comes before “silenced”."),
     "k1-with-the-wrong-sign": (
@@ -475,6 +479,7 @@ WHICH_DIAGNOSTICS = Exercise(
         Case("a large clip_range", _log(kl=1, fraction=1, spread=1.0, clip_range=0.6)),
         Case("identical policies: all fit", _standstill_log, closed_form=_fit(0, 1, 2, 3), visible=True, draws=1),
         Case("a KL by no rule", _log(by=(2e-3, 0.0)), visible=True),
+        Case("a step far too large, a little off", _log(kl=1, spread=4.0, by=(5e-5, 0.0)), visible=True),
         Case("numbers by no rule, both below", _log(kl=1, by=(-0.9, -1.5)), closed_form=_fit(), visible=True, draws=1),
         Case("numbers by no rule, both above", _log(kl=1, by=(0.9, 1.5)), closed_form=_fit(), draws=1),
         Case(
