@@ -1293,6 +1293,15 @@ def _climbing(agent, obs, noise, alpha):
     return loss.detach(), log_probs.detach()
 
 
+def _by_one_critic(agent, obs, noise, alpha):
+    """The policy's step, judged by the first critic alone."""
+    actions, log_probs = _acting(agent, obs, noise)
+    q1, _ = sac.values(agent.critics, obs, actions, learn=False)
+    loss = ch47.sac_actor_loss(q1, q1, log_probs, alpha)
+    sac.minimise(loss, agent.actor_optimizer)
+    return loss.detach(), log_probs.detach()
+
+
 def _unmoved(agent, obs, noise, alpha):
     """The policy's loss, and no step."""
     actions, log_probs = _acting(agent, obs, noise)
@@ -1377,6 +1386,11 @@ _WRONG_SAC_UPDATE = {
         {"noises": lambda next_noise, noise: (noise, next_noise)},
         "The two noises have changed places: next_noise makes the actions in next_obs, noise those in obs.",
     ),
+    "next-action-without-noise": (
+        {"noises": lambda next_noise, noise: (torch.zeros_like(next_noise), noise)},
+        "The target's action is the middle of the policy's distribution: it is drawn like every other, with next_noise, and its entropy"
+        " is paid for.",
+    ),
     "policy-before-the-critics": (
         {"order": "policy target critics temperature copies"},
         "The policy moves before the critics: its loss, and the target's action, are then those of other networks. Critics first.",
@@ -1424,6 +1438,10 @@ _WRONG_SAC_UPDATE = {
     "action-detached": (
         {"policy": lambda agent, obs, noise, alpha: _step_of_policy(agent, obs, noise, alpha, gradient=False)},
         "The policy's action is cut from the graph before the critics see it: no reward reaches the policy.",
+    ),
+    "policy-judged-by-one-critic": (
+        {"policy": _by_one_critic},
+        "One critic judges the policy's actions: hand q1 and q2 to sac_actor_loss, which takes the smaller.",
     ),
     "policy-judged-by-the-copies": (
         {"policy": lambda agent, obs, noise, alpha: _step_of_policy(agent, obs, noise, alpha, agent.targets)},

@@ -496,6 +496,11 @@ def _for_good(s, r, threshold):
     return _crossing(k if k < len(r) else None, s, r, threshold)
 
 
+def _last_crossing(s, r, threshold):
+    crossings = [k for k in range(1, len(r)) if r[k - 1] < threshold <= r[k]]
+    return _crossing(crossings[-1], s, r, threshold) if crossings else _right(s, r, threshold)
+
+
 def _above_only(s, r, threshold):
     return _crossing(next((k for k, value in enumerate(r) if value > threshold), None), s, r, threshold)
 
@@ -607,6 +612,10 @@ _WRONG_STEPS_TO_THRESHOLD = {
     "for-good": (
         _for_good,
         "This is where the curve stays above from then on. Asked for is where it *first* reaches the threshold, lost again or not.",
+    ),
+    "last-crossing": (
+        _last_crossing,
+        "Of several crossings this is the last one. Asked for is where the curve *first* reaches the threshold: a run may dip again.",
     ),
     "strictly-above": (_above_only, "A return that equals the threshold reaches it: ≥, not >."),
     "at-the-best": (_at_the_best, "This is where the run was best, not where it first was good enough."),

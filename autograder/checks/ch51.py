@@ -244,6 +244,7 @@ def _stacked(*columns):
 
 def _dream(
     condition=lambda start, latest: latest,
+    asked=lambda start, latest: latest,
     act=lambda policy, obs, generator: policy(obs, generator),
     ends=lambda alive, goes_on: alive * goes_on,
     **changed,
@@ -255,7 +256,7 @@ def _dream(
         alive = torch.ones(len(start_obs), dtype=start_obs.dtype)
         for _ in range(horizon):
             seen = condition(start_obs, obs[-1])
-            chosen = act(policy, seen, generator)
+            chosen = act(policy, asked(start_obs, seen), generator)
             following, reward, goes_on = model(seen, chosen, generator)
             alive = ends(alive, goes_on)
             obs.append(following)
@@ -338,6 +339,14 @@ _WRONG_IMAGINE = {
     "always-from-the-start": (
         _dream(condition=lambda start, latest: start),
         "Every step begins at start_obs again: the next one begins where the last one led to.",
+    ),
+    "policy-asked-about-the-start": (
+        _dream(asked=lambda start, latest: start),
+        "The policy is asked about start_obs at every step: ask it about the state that the last step led to.",
+    ),
+    "horizon-taken-for-an-end": (
+        _dream(continues=lambda x: torch.cat([x[:-1], torch.zeros_like(x[-1:])])),
+        "The last step's continues is 0 because the loop ends there. The trajectory does not: only the model says where one ends.",
     ),
     "end-forgotten": (
         _dream(ends=lambda alive, goes_on: goes_on),
