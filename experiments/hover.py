@@ -40,6 +40,10 @@ PARTS: dict[str, Mapping[str, float]] = {
     "no_clip": {"clip_range": INFINITE},
     "no_normalisation": {"normalize_advantages": False},
     "entropy_bonus": {"ent_coef": 0.01},
+    "value_loss_0": {"vf_coef": 0.0},
+    "value_loss_0.05": {"vf_coef": 0.05},
+    "value_loss_5": {"vf_coef": 5.0},
+    "no_norm_bound": {"max_grad_norm": INFINITE},
     "fast_no_clip": FAST | {"clip_range": INFINITE},
     "fast_target_kl": FAST | {"clip_range": INFINITE, "target_kl": 0.02},
 }
