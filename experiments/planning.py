@@ -124,8 +124,7 @@ def promised(model: mbpo.Ensemble) -> float:
 def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result:
     """Swing up once, and measure the models; it takes seconds, so that no checkpoint is kept."""
     planner = {name: VARIANTS[variant][name] for name in PLANNER}
-    cap = {"cap": True} if VARIANTS[variant].get("capped") else {}
-    returns, models, everything = swing_up(seed, report, planner, **cap)
+    returns, models, everything = swing_up(seed, report, planner, cap="capped" in VARIANTS[variant])
     real, taken = pieces_of(*episode_of(everything))
     columns = {"still": (real[1:] - real[0]).square().mean((1, 2)).sqrt()}
     for i, model in enumerate(models, start=1):

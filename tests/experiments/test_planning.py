@@ -30,7 +30,7 @@ def test_the_page_shows_the_program_that_was_recorded(tiny):
 
 def test_rows_are_horizons_and_the_summary_has_each_return(tiny, tmp_path, monkeypatch):
     swing_up = planning.swing_up
-    monkeypatch.setattr(planning, "swing_up", lambda seed, report, planner: swing_up(seed, report, planner, episodes=2))
+    monkeypatch.setattr(planning, "swing_up", lambda *given, cap: swing_up(*given, episodes=2, cap=cap))
     told = []
     result = planning.run("swing_up", 0, tmp_path, lambda done, total: told.append((done, total)))
     assert [row["horizon"] for row in result.rows] == list(range(1, 51))
