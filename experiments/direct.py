@@ -2,9 +2,9 @@
 
 Every variant begins with the fine-tuned policy of the experiment rlhf and learns from some of the comparisons that the reward model there
 has, in one epoch; a run's seed is that of both. "coin" tosses a coin for every label. "own_texts" learns from that policy's own texts
-instead, the best and the worst of four as the reward model orders them, "own_texts_two" from two of each prompt; "own_texts_twice" from as
-many, of which the second half are written by the policy as it is by then. "whole_picked" learns from the best and the worst of four texts
-that people wrote, by the same reward model.
+instead, the best and the worst of four as the reward model orders them, and so at other weights beta in "own_texts_0.2" and its like;
+"own_texts_two" from two of each prompt; "own_texts_twice" from as many, of which the second half are written by the policy as it is by
+then. "whole_picked" learns from the best and the worst of four texts that people wrote, by the same reward model.
 A row stands for five steps; in some of them texts of the policy as it is then are looked at. At the end it is judged on prompts and on
 rated texts that it has not seen.
 """
@@ -45,6 +45,7 @@ VARIANTS: dict[str, dict] = {
     "reward_model": COMMON | {"loss": "reward model"},
     "own_texts": COMMON | {"candidates": 4, "look": 10},
     "own_texts_twice": COMMON | {"candidates": 4, "look": 10, "rounds": 2},
+    **{f"own_texts_{beta:g}": COMMON | {"candidates": 4, "beta": beta} for beta in (0.15, 0.2, 0.3)},
     "own_texts_two": COMMON | {"candidates": 2},
     "whole_picked": COMMON | {"labels": "reward model, best and worst of four"},
     "coin": COMMON | {"labels": "coin"},
