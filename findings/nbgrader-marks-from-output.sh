@@ -22,7 +22,8 @@ python3 -m venv "$folder/venv"
     nbconvert==7.17.2 nbformat==5.11.1 SQLAlchemy==2.1.9 alembic==1.20.1
 mkdir "$folder/course"
 cd "$folder/course"
-export PATH="$folder/venv/bin:$PATH" PYTHONWARNINGS=ignore
+export PATH="$folder/venv/bin:$PATH"
+unset PYTHONWARNINGS  # it would keep the test from warning
 cat >nbgrader_config.py <<'PYTHON'
 get_config().CourseDirectory.course_id = "finding"
 PYTHON
