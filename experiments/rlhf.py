@@ -33,6 +33,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "distilled": {"candidates": 8, "prompts": 640, "steps": 40, "batch": 16, "learning_rate": 2e-4},
     **{f"flipped_{rate}": {"flipped": rate} for rate in (0.0, 0.1, 0.2, 0.3, 0.4)},
     **{f"comparisons_{count}": {"comparisons": count} for count in (250, 1000, 16_000)},
+    "margin_same": {"by": ["nothing"], "mean_margins": [0.0, 1.0, 3.0]},
+    "margin_graded": {"by": ["answer", "panels"], "mean_margins": [1.0, 3.0]},
     "frozen_body": {"features": "tiny, last layer, last token"},
     "ppo_kl_0.0": {"kl_coef": 0.0, "iterations": 50},
     "ppo_kl_0.2": {"kl_coef": 0.2, "iterations": 40},
@@ -46,7 +48,7 @@ OTHER = 100  # added to a seed for the second reward model: other comparisons, o
 def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result:
     """One part of the pipeline; those before it are made, or taken from this process's earlier runs."""
     kind = variant.partition("_")[0]
-    kinds = {"sft": _sft, "ppo": _ppo, "best": _best_of_n, "distilled": _distilled, "frozen": _frozen_body}
+    kinds = {"sft": _sft, "ppo": _ppo, "best": _best_of_n, "distilled": _distilled, "frozen": _frozen_body, "margin": _margins}
     return kinds.get(kind, _labels)(variant, seed, report)
 
 
@@ -64,9 +66,9 @@ def reward_model(seed: int) -> RewardModel:
     return _fitted(preferences.comparisons(COMPARISONS, seed), seed)
 
 
-def _fitted(comparisons: preferences.Preferences, seed: int) -> RewardModel:
+def _fitted(comparisons: preferences.Preferences, seed: int, margins: torch.Tensor | None = None) -> RewardModel:
     model = RewardModel(lm.load("tiny"), seed=seed)
-    return fit(model, comparisons, ch96.reward_model_loss, ch96.last_token_scores, seed)
+    return fit(model, comparisons, ch96.reward_model_loss, ch96.last_token_scores, seed, margins=margins)
 
 
 @functools.cache
@@ -227,6 +229,68 @@ def _labels(variant: str, seed: int, report: Report) -> Result:
         "cpu_seconds": seconds,
     }
     return Result([row], row)
+
+
+def _margins(variant: str, seed: int, report: Report) -> Result:
+    """Reward models of the same comparisons, in the same order and from the same weights: the margin alone differs.
+
+    It is the same for every comparison; or it grows with how clear the difference was, to the two raters who answered, or by the means
+    of both panels, whoever is right; its mean over the comparisons is given. Accuracy is on all pairs of held-out texts, and on those
+    whose mean ratings lie closer than 1, from 1 to 3 and at least 3 apart. Claims are held against the raters' chances on 20,000 held-out
+    pairs, in nats an answer, before and after the gaps are divided by the number that is best on the split "validation".
+    """
+    answers, test = preferences.comparisons(COMPARISONS, seed), preferences.load("test")
+    generator = torch.Generator().manual_seed(60_000 + seed)
+    told = preferences.told_differences(answers, preferences.load("reward_model"), generator)
+    clear = {"nothing": torch.ones(len(answers)), "answer": told, "panels": answers.gap.abs()}
+    choices = [(by, mean) for by in VARIANTS[variant]["by"] for mean in VARIANTS[variant]["mean_margins"]]
+    rows: list[dict[str, Any]] = []
+    for by, mean in choices:
+        model = _fitted(answers, seed, mean * clear[by] / clear[by].mean())
+        scores = model.scores(test.texts, ch96.last_token_scores)
+        seen = model.scores(answers.texts, ch96.last_token_scores)
+        gaps, people = _asked(model, "validation")
+        divisor = min((step / 20 for step in range(10, 400)), key=lambda divided: _surprise(gaps / divided, people))
+        gaps, people = _asked(model, "test")
+        rows.append({
+            "by": by,
+            "mean_margin": mean,
+            "accuracy": preferences.pairwise_accuracy(scores, test.means).estimate,
+            **{name: _ordered(scores, test.means, low, high) for name, low, high in BANDS},
+            "training_accuracy": (seen[answers.chosen] > seen[answers.rejected]).float().mean().item(),
+            "deviation": scores.std().item(),
+            "claimed": torch.sigmoid(gaps).mean().item(),
+            "agreed": people.mean().item(),
+            "nats": _surprise(gaps, people),
+            "divisor": divisor,
+            "nats_divided": _surprise(gaps / divisor, people),
+        })  # fmt: skip
+        report(len(rows), len(choices))
+    return Result(rows)
+
+
+BANDS = (("close", 0.0, 1.0), ("between", 1.0, 3.0), ("far", 3.0, float("inf")))  # of two mean ratings
+
+
+def _ordered(scores: torch.Tensor, means: torch.Tensor, low: float, high: float) -> float:
+    """Share of the pairs of texts that the scores order as the means do, of those pairs whose means lie from low to below high apart."""
+    apart = means[:, None] - means[None, :]
+    here = (apart > 0) & (apart >= low) & (apart < high)
+    return (((scores[:, None] - scores[None, :]).sign() + 1) / 2)[here].mean().item()
+
+
+def _asked(model: RewardModel, split: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """Of pairs of a split's texts: the model's gap, and the chance that two raters agree with its sign; (B,) each."""
+    pairs = preferences.comparisons(20_000, 0, split)
+    scores = model.scores(pairs.texts, ch96.last_token_scores)
+    gaps = scores[pairs.chosen] - scores[pairs.rejected]
+    return gaps.abs(), torch.where(gaps > 0, 1 - pairs.disagreement, pairs.disagreement)
+
+
+def _surprise(gaps: torch.Tensor, people: torch.Tensor) -> float:
+    """Mean negative log-likelihood of the raters' answers, in nats."""
+    log_likely, log_unlikely = (torch.nn.functional.logsigmoid(z) for z in (gaps, -gaps))
+    return -(people * log_likely + (1 - people) * log_unlikely).mean().item()
 
 
 def _frozen_body(variant: str, seed: int, report: Report) -> Result:

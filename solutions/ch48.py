@@ -1,5 +1,5 @@
-"""Reference solutions of chapter 48: the statistics of a fair comparison, what the bug lab's
-buffer should keep, and a fast update of soft actor-critic.
+"""Reference solutions of chapter 48: the statistics of a fair comparison, censored races, what
+the bug lab's buffer should keep, and a fast update of soft actor-critic.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import math
 import numpy as np
 import torch
 
+from course_lib import validate
 from course_lib.control.replay import Transitions
 from solutions.ch47 import polyak_update
 
@@ -102,6 +103,48 @@ def steps_to_threshold(steps, returns, threshold):
     share = torch.where(first > 0, (threshold - low) / (high - low), 0.0)
     crossed = steps[before] + share * (steps[first] - steps[before])
     return torch.where(reached.any(1), crossed, math.inf).to(returns.dtype)
+
+
+def race_counts(ours, our_ends, theirs, their_ends):
+    """How many races were won, how many lost, and of how many nobody knows, each of our runs
+    against each of theirs.
+
+        won = #{(i, j): a_i < b_j and a_i ≤ v_j},   lost = #{(i, j): b_j < a_i and b_j ≤ u_i},
+        undecided = n m - won - lost
+
+    A run that did not cross is censored: below the line up to its end, the end included, and
+    unknown from there on. A race is won if ours is sure to have crossed first: theirs crossed
+    later, or had not crossed by its end, and that end is not before our crossing. All other
+    races are undecided. They are of three kinds: one run crossed, but after the end of a
+    censored one; neither crossed, however long each was watched; both crossed at the same
+    moment, and nobody is first.
+
+    Gehan (1965), the score of a pair, https://doi.org/10.1093/biomet/52.1-2.203
+
+    Args:
+      ours: a, when each of n runs crossed, in environment steps or in seconds; infinity where
+        it never did; (n,).
+      our_ends: u, when each was last evaluated, in the same units; finite; (n,).
+      theirs: b, of m other runs the same as ours; (m,).
+      their_ends: v; (m,).
+
+    Returns: (won, lost, undecided), 0-dim int64 tensors. Their sum is n m.
+    Raises: ValueError that names an argument if ours and our_ends, or theirs and their_ends,
+      differ in shape, or if a run crossed after its end.
+    """
+    validate.same_shape(ours=ours, our_ends=our_ends)
+    validate.same_shape(theirs=theirs, their_ends=their_ends)
+    for name, crossed, ends in (("ours", ours, our_ends), ("theirs", theirs, their_ends)):
+        late = crossed.isfinite() & (crossed > ends)
+        if late.any():
+            raise ValueError(
+                f"{name} must lie at or before the run's end, or be infinite, got "
+                f"{crossed[late].tolist()} for ends {ends[late].tolist()}"
+            )
+    ours, our_ends = ours[:, None], our_ends[:, None]  # (n, 1): against (m,), all pairs
+    won = ((ours < theirs) & (ours <= their_ends)).sum()
+    lost = ((theirs < ours) & (theirs <= our_ends)).sum()
+    return won, lost, ours.numel() * theirs.numel() - won - lost
 
 
 def repaired_transitions(obs, sent, rewards, next_obs, terminated, truncated, low, high):

@@ -58,6 +58,42 @@ def reward_model_loss(chosen_scores, rejected_scores, margin=None):
     return -functional.logsigmoid(gaps).mean()
 
 
+def in_reference_units(scores, reference_scores, kl_coef):
+    """Scores in units of the reference's texts, and the weight of the KL penalty that means
+    the same there.
+
+        score'_ij = (score_ij - zero_i) / unit
+        π_ref exp(score' / β') ∝ π_ref exp(score / β),   for each prompt i
+
+    Comparisons of texts to one prompt fix no zero that prompts have in common. So each
+    prompt has its own: the mean of the reference's scores there. The unit is one number for
+    all prompts: the deviation of the reference's scores within a prompt, which is the square
+    root of the mean over prompts of their unbiased variances (sum of squares over k - 1).
+    Nothing is added to it. The second line is what RLHF would reach: Rafailov et al. (2023),
+    eq. 4, https://arxiv.org/abs/2305.18290
+
+    Args:
+      scores: of n ≥ 1 texts of any policy to each of B prompts; (B, n). Receives gradient.
+      reference_scores: of k ≥ 2 texts of the reference policy to the same prompts, of the
+        same reward model; (B, k). No gradient.
+      kl_coef: β ≥ 0, in units of `scores` per nat.
+
+    Returns: score', (B, n); and β', float, in the new unit per nat.
+    Raises: ValueError that names an argument if the numbers of prompts differ, k < 2,
+      kl_coef < 0, or no prompt has reference_scores that differ.
+    """
+    validate.same_length(scores=scores, reference_scores=reference_scores)
+    validate.non_negative(kl_coef=kl_coef)
+    reference = reference_scores.detach()
+    if reference.shape[1] < 2 or bool((reference == reference[:, :1]).all()):
+        raise ValueError(
+            "reference_scores must have at least two texts to each prompt, and to some prompt"
+            f" two scores, got {tuple(reference.shape)} with a deviation of 0"
+        )
+    unit = reference.var(1).mean().sqrt()
+    return (scores - reference.mean(1, keepdim=True)) / unit, kl_coef / unit.item()
+
+
 def best_of_n(scores):
     """Of n candidates for each prompt, the one with the highest score.
 

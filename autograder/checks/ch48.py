@@ -1,7 +1,8 @@
-"""Checks of chapter 48: cases, named misconceptions and correct variants for the statistics of comparisons and the bug lab."""
+"""Checks of chapter 48: cases, named misconceptions and correct variants for the statistics of comparisons, races and the bug lab."""
 
 from __future__ import annotations
 
+import bisect
 import itertools
 import math
 
@@ -16,12 +17,14 @@ from autograder.authoring.parts import (
     drawn_once,
     dtype_lost,
     in_place,
+    integers,
     misshapen,
     normal,
     number,
     one_shape,
     python_float,
     replaced,
+    rows_cut,
     satisfies,
     shape_cases,
     spoilt,
@@ -687,6 +690,345 @@ STEPS_TO_THRESHOLD = Exercise(
     },
 )
 
+# ----------------------------------------------------------------------------------------------------------- race_counts
+
+NEVER = None
+
+
+@drawing
+def _races(generator, ours, theirs, unit=1000.0):
+    """Runs by the places of crossing and end, (place or NEVER, place), among moments that are drawn anew: who is before whom stays as it
+    is, and a tie is one to the last bit."""
+    moments = (unit * 64 * (0.1 + uniform(generator, 20)).cumsum(0)).round() / 64
+
+    def when(places):
+        return torch.tensor([math.inf if place is NEVER else moments[place].item() for place in places], dtype=torch.float64)
+
+    columns = [when(places) for side in (ours, theirs) for places in zip(*side, strict=True)]
+    return dict(zip(("ours", "our_ends", "theirs", "their_ends"), columns, strict=True))
+
+
+@drawing
+def _any_races(generator, n=5, m=7, places=12):
+    """Races of all kinds; a third of the runs is censored, and among so few moments some tie."""
+
+    def side(size):
+        ends = integers(generator, 2, places, size)
+        crossings = (uniform(generator, size) * (ends + 1)).long()
+        censored = uniform(generator, size) < 0.35
+        return [
+            (NEVER if gone else at, end)
+            for at, end, gone in zip(crossings.tolist(), ends.tolist(), censored.tolist(), strict=True)
+        ]
+
+    return _races(side(n), side(m))(generator)
+
+
+_SHAPES = (one_shape("ours", "our_ends"), one_shape("theirs", "their_ends"))
+_only_shapes = versions_of(ch48.race_counts, *_SHAPES)
+_races_of = versions_of(
+    ch48.race_counts,
+    *_SHAPES,
+    satisfies(lambda ours, our_ends: bool(((ours <= our_ends) | ours.isinf()).all())),
+    satisfies(lambda theirs, their_ends: bool(((theirs <= their_ends) | theirs.isinf()).all())),
+)
+
+
+def _counts(*numbers):
+    return tuple(torch.tensor(count) for count in numbers)
+
+
+def _pair_by_pair(verdict, pairs=itertools.product):
+    """A version: `verdict(a, u, b, v)` is 1 where ours won, -1 where theirs did, 0 where nobody knows, and None for what is not counted."""
+
+    def version(*given):
+        ours, our_ends, theirs, their_ends = (column.tolist() for column in given)
+        runs = pairs(zip(ours, our_ends, strict=True), zip(theirs, their_ends, strict=True))
+        found = [verdict(*one, *other) for one, other in runs]
+        return _counts(*(found.count(result) for result in (1, -1, 0)))
+
+    return _races_of(version)
+
+
+def _all_pairs(ours, our_ends, theirs, their_ends):
+    one, its_end = ours[:, None], our_ends[:, None]
+    won = ((one < theirs) & (one <= their_ends)).sum()
+    lost = ((theirs < one) & (theirs <= its_end)).sum()
+    return won, lost, len(ours) * len(theirs) - won - lost
+
+
+def _all_after(change):
+    """A version that would be right, had `change` not been made to the four columns."""
+    return _races_of(lambda *given: _all_pairs(*change(*given)))
+
+
+def _cut_to(last, ours, our_ends, theirs, their_ends):
+    """Nothing that came later than `last` was seen."""
+    cut = (torch.where(crossed <= last, crossed, math.inf) for crossed in (ours, theirs))
+    return next(cut), our_ends.clamp(max=last), next(cut), their_ends.clamp(max=last)
+
+
+def _earlier(a, b):
+    return (a < b) - (b < a)
+
+
+def _by_cases(a, u, b, v):
+    """What is right, case by case."""
+    if a < math.inf and b < math.inf:
+        return _earlier(a, b)
+    if a < math.inf:
+        return int(v >= a)
+    if b < math.inf:
+        return -int(u >= b)
+    return 0
+
+
+def _unless(condition, otherwise):
+    """What is right, but for pairs of which `condition(a, u, b, v)` is true."""
+    return lambda *pair: otherwise(*pair) if condition(*pair) else _by_cases(*pair)
+
+
+def _in_the_common_window(ours, our_ends, theirs, their_ends):
+    """A variant: a race lasts as long as both are watched; who has not crossed by then has not crossed."""
+    last = torch.minimum(our_ends[:, None], their_ends[None])
+    one = torch.where(ours[:, None] <= last, ours[:, None], math.inf)
+    other = torch.where(theirs[None] <= last, theirs[None], math.inf)
+    signs = (other - one).nan_to_num(0).sign()  # infinity minus infinity: neither
+    return (signs > 0).sum(), (signs < 0).sum(), (signs == 0).sum()
+
+
+def _from_sorted(ours, our_ends, theirs, their_ends):
+    """A variant: of sorted lists, how many of them lie behind each crossing."""
+
+    def beaten(crossed, others, ends):
+        arrived = sorted(at for at in others.tolist() if at < math.inf)
+        stopped = sorted(end for at, end in zip(others.tolist(), ends.tolist(), strict=True) if at == math.inf)
+        mine = [at for at in crossed.tolist() if at < math.inf]
+        return sum(
+            len(arrived) - bisect.bisect_right(arrived, at) + len(stopped) - bisect.bisect_left(stopped, at) for at in mine
+        )
+
+    won, lost = beaten(ours, theirs, their_ends), beaten(theirs, ours, our_ends)
+    return _counts(won, lost, len(ours) * len(theirs) - won - lost)
+
+
+def _in_numpy(*given):
+    """A variant: a censored run's end stands for its crossing, and what crosses no later than that, ties apart, has won."""
+    ours, our_ends, theirs, their_ends = (column.numpy() for column in given)
+    tied = np.equal.outer(ours, theirs)
+    won = np.less_equal.outer(ours, np.where(np.isinf(theirs), their_ends, theirs)) & ~tied
+    lost = np.greater_equal.outer(np.where(np.isinf(ours), our_ends, ours), theirs) & ~tied
+    return tuple(torch.tensor(int(table.sum())) for table in (won, lost, ~(won | lost)))
+
+
+def _gehan_scores(ours, our_ends, theirs, their_ends):
+    """A variant: Gehan's score of each pair, summed by its sign."""
+    known = ours.isfinite()[:, None], theirs.isfinite()
+    later = (ours[:, None] < theirs) & known[1] | (ours[:, None] <= their_ends) & ~known[1]
+    earlier = (theirs < ours[:, None]) & known[0] | (theirs <= our_ends[:, None]) & ~known[0]
+    score = later.long() - earlier.long()
+    return (score == 1).sum(), (score == -1).sum(), (score == 0).sum()
+
+
+def _both_censored(a, _u, b, _v):
+    return math.isinf(a) and math.isinf(b)
+
+
+def _tied(a, _u, b, _v):
+    return a == b < math.inf
+
+
+def _with_halves(*given):
+    won, lost, undecided = _all_pairs(*given)
+    ties = (given[0].isfinite()[:, None] & (given[0][:, None] == given[2])).sum()
+    return won + ties / 2, lost + ties / 2, (undecided - ties).float()
+
+
+_WRONG_RACE_COUNTS = {
+    "censored-dropped": (
+        _pair_by_pair(_unless(lambda a, _u, b, _v: math.isinf(max(a, b)), lambda *_: None)),
+        "Races with a censored run are left out, and with them the slow runs: an algorithm is judged by its successes. They belong to the"
+        " n m races, and many of them are decided.",
+    ),
+    "infinity-is-a-time": (
+        _pair_by_pair(lambda a, _u, b, _v: _earlier(a, b)),
+        "A censored run loses to everybody who ever crossed, since infinity is later. But it is known to be slower only if it was still"
+        " watched then: compare with the end of the *other* run.",
+    ),
+    "crossed-at-the-end": (
+        _pair_by_pair(lambda a, u, b, v: _earlier(min(a, u), min(b, v))),
+        "A censored run counts as if it had crossed at its end. Its crossing, if there is one, lies after that: whoever crosses before"
+        " the end of a censored run has won, and nothing else is known.",
+    ),
+    "censored-is-undecided": (
+        _pair_by_pair(_unless(lambda a, _u, b, _v: math.isinf(max(a, b)), lambda *_: 0)),
+        "Every race with a censored run is undecided here. One that was below the line up to 100,000 steps has lost to one that crossed at"
+        " 80,000.",
+    ),
+    "ties-won": (
+        _pair_by_pair(_unless(_tied, lambda *_: 1)),
+        "Where both crossed at the same moment nobody was first: a tie is not won. Compare with <, and with ≤ only where an end stands.",
+    ),
+    "ties-lost": (
+        _pair_by_pair(_unless(_tied, lambda *_: -1)),
+        "Where both crossed at the same moment nobody was first: a tie is not lost, and in the exchanged order it would be won.",
+    ),
+    "ties-dropped": (
+        _pair_by_pair(_unless(_tied, lambda *_: None)),
+        "The three counts do not add up to n m: a race in which both crossed at the same moment has no winner, and counts as undecided.",
+    ),
+    "ties-halved": (
+        _races_of(_with_halves),
+        "A tie goes half to each side here, as in a probability of improvement. These are counts of races that were won: a tie is not, and"
+        " counts as undecided.",
+    ),
+    "both-censored-dropped": (
+        _pair_by_pair(_unless(_both_censored, lambda *_: None)),
+        "The three counts do not add up to n m: a race in which neither crossed is undecided, and counts.",
+    ),
+    "longer-watched-loses": (
+        _pair_by_pair(_unless(_both_censored, lambda _a, u, _b, v: _earlier(u, v))),
+        "Of two censored runs the one that was watched longer counts as the slower. Its crossing lies after its end, the other's after an"
+        " earlier one: either may be first.",
+    ),
+    "longer-watched-wins": (
+        _pair_by_pair(_unless(_both_censored, lambda _a, u, _b, v: _earlier(v, u))),
+        "Of two censored runs the one that was stopped earlier counts as the loser. It is known only that each crosses after its own end:"
+        " either may be first.",
+    ),
+    "at-the-end-is-too-late": (
+        _pair_by_pair(_unless(lambda a, u, b, v: (a == v and math.isinf(b)) or (b == u and math.isinf(a)), lambda *_: 0)),
+        "A run that crossed at the very moment of the other's last evaluation has won: there the other was seen below the line. ≤ the end,"
+        " not <.",
+    ),
+    "crossing-at-the-own-end-is-censored": (
+        _all_after(lambda a, u, b, v: (a.masked_fill(a == u, math.inf), u, b.masked_fill(b == v, math.inf), v)),
+        "A run that crossed with its own last evaluation counts as censored. Censored are those whose crossing is infinite.",
+    ),
+    "our-censored-have-lost": (
+        _pair_by_pair(_unless(lambda a, _u, b, _v: a == math.inf > b, lambda *_: -1)),
+        "A censored run of theirs is treated rightly, and one of ours has lost to everybody: exchange the sides, and won and lost must"
+        " change places. Whether ours had lost by its end depends on our_ends.",
+    ),
+    "their-censored-have-lost": (
+        _pair_by_pair(_unless(lambda a, _u, b, _v: a < math.inf == b, lambda *_: 1)),
+        "A censored run of ours is treated rightly, and one of theirs has lost to everybody: exchange the sides, and won and lost must"
+        " change places. Whether theirs had lost by its end depends on their_ends.",
+    ),
+    "seed-against-seed": (
+        _pair_by_pair(_by_cases, pairs=zip),
+        "Run i races run i only. Seed 3 of one algorithm has nothing to do with seed 3 of another: each of ours races each of theirs, n m"
+        " races.",
+    ),
+    "the-longest-end-for-all": (
+        _all_after(lambda a, u, b, v: (a, torch.full_like(u, u.max()), b, torch.full_like(v, v.max()))),
+        "All runs of a side are taken to have been watched as long as the longest of them. Each has an end of its own: broadcast the ends"
+        " like the crossings.",
+    ),
+    "the-shortest-end-for-all": (
+        _all_after(lambda a, u, b, v: (a, torch.full_like(u, u.min()), b, torch.full_like(v, v.min()))),
+        "All runs of a side are taken to have been watched only as long as the shortest of them, and what the others showed is thrown away."
+        " Each has an end of its own: broadcast the ends like the crossings.",
+    ),
+    "all-cut-to-the-shortest": (
+        _all_after(lambda *given: _cut_to(min(given[1].min(), given[3].min()), *given)),
+        "All runs are cut to the shortest of all before they race, and what the others showed later is thrown away. Each race lasts as long"
+        " as its own two runs were watched.",
+    ),
+    "exchanged": (
+        _pair_by_pair(lambda a, u, b, v: -_by_cases(a, u, b, v)),
+        "Won and lost are exchanged: the earlier crossing wins, as fewer steps are better.",
+    ),
+    "undecided-is-all": (
+        _races_of(after(ch48.race_counts, lambda counts: (*counts[:2], sum(counts)))),
+        "The third count is that of all races. Undecided are those which neither side has won.",
+    ),
+    "shares": (
+        _races_of(lambda *given: tuple(count / given[0].numel() / given[2].numel() for count in ch48.race_counts(*given))),
+        "These are shares of all races. Return the counts: 1 of 1 and 25 of 25 are not the same evidence.",
+    ),
+    "python-ints": (
+        after(ch48.race_counts, lambda counts: tuple(count.item() for count in counts)),
+        "Return 0-dim tensors, not Python integers: torch.tensor(count), or .sum() of a table of truth values.",
+    ),
+    "counts-as-floats": (
+        after(ch48.race_counts, lambda counts: tuple(count.double() for count in counts)),
+        "Counts are whole numbers: the sum of a bool tensor is int64 without a detour by .float().",
+    ),
+    "crossing-after-the-end-accepted": (
+        _only_shapes(_all_pairs),
+        "A run cannot be seen to cross after its own end; most often steps have met thousands of steps, or seconds. Refuse it.",
+    ),
+}
+
+_MIXED = {
+    "ours": [(2, 9), (5, 9), (NEVER, 6), (NEVER, 12)],
+    "theirs": [(5, 10), (7, 15), (NEVER, 3), (NEVER, 11), (1, 4)],
+}
+_FOUR = {
+    "ours": [(9, 12), (3, 5), (NEVER, 4), (7, 7)],
+    "theirs": [(2, 8), (NEVER, 6), (5, 13), (8, 11)],
+}
+
+
+def _moved(name, to):
+    """One of the crossings lies after its end."""
+    side = {"ours": "our_ends", "theirs": "their_ends"}[name]
+    return altered(_races(**_MIXED), lambda given: {name: torch.where(given[name].isfinite(), given[side] + to, given[name])})
+
+
+RACE_COUNTS = Exercise(
+    name="race_counts",
+    reference=ch48.race_counts,
+    criteria={"values": 1.6, "dtype": 0.1, "inputs": 0.1, "errors": 0.2},
+    cases=drawn_once(
+        Case("all cross", _races([(3, 9), (6, 9), (8, 9)], [(4, 9), (5, 9), (7, 9), (1, 9)]), visible=True),
+        Case("one of ours crosses between the ends of two of theirs", _races([(6, 9)], [(NEVER, 4), (NEVER, 8)]), visible=True),
+        Case("one of theirs crosses between the ends of two of ours", _races([(NEVER, 4), (NEVER, 8)], [(6, 9)]), visible=True),
+        Case(
+            "none crosses, and the ends differ",
+            _races([(NEVER, 3), (NEVER, 8)], [(NEVER, 5)]),
+            closed_form=lambda **_given: _counts(0, 0, 2),
+            visible=True,
+        ),
+        Case("ties", _races([(4, 9), (6, 9)], [(4, 8), (6, 9), (2, 9)]), visible=True),
+        Case(
+            "one crosses at the other's end",
+            _races([(5, 9), (NEVER, 5)], [(NEVER, 5), (5, 7)]),
+            closed_form=lambda **_given: _counts(1, 1, 2),
+            visible=True,
+        ),
+        Case("runs with ends of their own", _races(**_MIXED), visible=True, draws=2),
+        Case("as many of ours as of theirs", _races(**_FOUR), visible=True),
+        Case("the sides exchanged", _races(_FOUR["theirs"], _FOUR["ours"])),
+        Case("runs that cross with their last step", _races([(4, 4), (7, 7)], [(NEVER, 4), (NEVER, 6), (7, 7)]), visible=True),
+        Case("a single race, stopped too early", _races([(3, 9)], [(NEVER, 2)])),
+        Case("in seconds", _races(**_MIXED, unit=7.0)),
+        Case("races of all kinds", _any_races(), draws=3),
+        Case("many races of all kinds", _any_races(n=20, m=30)),
+        Case("single precision", _races(**_MIXED), dtype=torch.float32, visible=True),
+        Case("ours cross after their ends", _moved("ours", 500.0), raises=["ours", "our_ends"], visible=True, draws=1),
+        Case("theirs cross after their ends", _moved("theirs", 500.0), raises=["theirs", "their_ends"], draws=1),
+        misshapen(
+            "one of our ends for all", _races(**_MIXED), "our_ends", lambda x: x[:1], ["ours", "our_ends"], visible=True, draws=1
+        ),
+        misshapen("an end of theirs too few", _races(**_MIXED), "their_ends", lambda x: x[1:], ["theirs", "their_ends"], draws=1),
+    ),
+    misconceptions=(
+        *wrong(_WRONG_RACE_COUNTS),
+        *spoilt(ch48.race_counts, changed="ours"),
+        bad_input_accepted(_races_of(rows_cut(_all_pairs), checked=False)),
+    ),
+    variants={
+        "case by case": _pair_by_pair(_by_cases),
+        "all pairs at once": _races_of(_all_pairs),
+        "cut to the common window": _races_of(_in_the_common_window),
+        "sorted lists": _races_of(_from_sorted),
+        "NumPy": _races_of(_in_numpy),
+        "Gehan's scores": _races_of(_gehan_scores),
+    },
+)
+
 # --------------------------------------------------------------------------------------------------- repaired_transitions
 
 _ROWS = ("sent", "rewards", "truncated")
@@ -846,5 +1188,6 @@ EXERCISES = (
     INTERQUARTILE_MEAN,
     BOOTSTRAP_INTERVAL,
     STEPS_TO_THRESHOLD,
+    RACE_COUNTS,
     REPAIRED_TRANSITIONS,
 )

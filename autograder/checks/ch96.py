@@ -10,8 +10,11 @@ import torch
 import torch.nn.functional as F
 
 from autograder.authoring.parts import (
+    CUT,
+    DTYPE,
     IN_PLACE,
     METRIC,
+    after,
     altered,
     bad_input_accepted,
     cut_from_graph,
@@ -302,6 +305,240 @@ REWARD_MODEL_LOSS = Exercise(
         "sum over count, in double precision": _loss(
             lambda c, r, m: -F.logsigmoid((c - r - m).double()).sum().to(c.dtype) / len(c)
         ),
+    },
+)
+
+# ---------------------------------------------------------------------------------------------------- in_reference_units
+
+
+@drawing
+def _of_two_policies(generator, batch=4, n=3, k=5, size=3.0, apart=2.0, kl_coef=0.05):
+    """Scores of n texts and of the reference's k to each prompt: their levels differ by prompt, and so do the reference's deviations."""
+    level = apart * normal(generator, batch, 1)
+    spread = torch.linspace(0.3, 1.7, batch, dtype=torch.float64)[torch.randperm(batch, generator=generator), None]
+    return {
+        "scores": size * (level + 0.7 + 0.6 * normal(generator, batch, n)),
+        "reference_scores": size * (level + spread * normal(generator, batch, k)),
+        "kl_coef": kl_coef,
+    }
+
+
+def _own_texts(generator):
+    """The first texts of PPO are the reference's."""
+    drawn = _of_two_policies(n=5)(generator)
+    return drawn | {"scores": drawn["reference_scores"].clone()}
+
+
+def _in_that_unit_already(generator):
+    """Each prompt's reference scores have mean 0 and variance 1."""
+    drawn = _of_two_policies(k=3)(generator)
+    return drawn | {"reference_scores": torch.tensor([[-1.0, 0.0, 1.0]] * 4, dtype=torch.float64)}
+
+
+def _one_of_equals(generator, prompts=1):
+    """The reference's texts to the first prompts all have one score."""
+    drawn = _of_two_policies(k=4)(generator)
+    levels = integers(generator, -5, 6, 4, 1).double()
+    drawn["reference_scores"][:prompts] = levels[:prompts].expand(prompts, 4)
+    return drawn
+
+
+def _all_equal(generator):
+    return _one_of_equals(generator, prompts=4)
+
+
+_ALL_OF_TWO_POLICIES = ("scores", "reference_scores")
+
+
+def _units_by_numpy(scores, reference_scores, kl_coef):
+    reference = reference_scores.detach().numpy()
+    unit = float(np.sqrt(np.mean(np.var(reference, axis=1, ddof=1))))
+    shifted = scores.detach().numpy() - reference.mean(1, keepdims=True)
+    return torch.from_numpy(shifted / unit).to(scores.dtype), kl_coef / unit
+
+
+_in_units = versions_of(
+    ch96.in_reference_units,
+    satisfies(lambda scores, reference_scores: len(scores) == len(reference_scores)),
+    satisfies(lambda kl_coef: kl_coef >= 0),
+    satisfies(lambda reference_scores: reference_scores.shape[1] >= 2),
+    satisfies(lambda reference_scores: (reference_scores != reference_scores[:, :1]).any()),
+    data=["reference_scores"],
+)
+
+
+def _converted(
+    zero=lambda s, r: r.mean(1, keepdim=True),
+    unit=lambda s, r: r.var(1).mean().sqrt(),
+    weight=lambda kl_coef, unit: kl_coef / unit,
+):
+    """A formula by where each prompt's zero is, what the unit is, and what becomes of the weight."""
+
+    def formula(scores, reference_scores, kl_coef):
+        of = unit(scores.detach(), reference_scores)
+        shifted = scores - zero(scores.detach(), reference_scores)
+        return shifted / of, weight(kl_coef, of.detach().double().mean().item())
+
+    return formula
+
+
+def _prompt_by_prompt(scores, reference_scores, kl_coef):
+    rows = reference_scores.tolist()
+    unit = math.sqrt(statistics.mean(statistics.variance(row) for row in rows))
+    zeros = [statistics.mean(row) for row in rows]
+    return torch.stack([(row - zero) / unit for row, zero in zip(scores, zeros, strict=True)]), kl_coef / unit
+
+
+def _by_pairs(scores, reference_scores, kl_coef):
+    """Half the mean squared difference of two texts to one prompt is their variance."""
+    k = reference_scores.shape[1]
+    differences = reference_scores[:, :, None] - reference_scores[:, None, :]
+    unit = (differences.square().sum() / (2 * len(reference_scores) * k * (k - 1))).sqrt()
+    return (scores - reference_scores.mean(1)[:, None]) / unit, float(kl_coef / unit)
+
+
+def _by_residuals(scores, reference_scores, kl_coef):
+    zero = reference_scores.mean(1, keepdim=True)
+    residuals = (reference_scores - zero).flatten()
+    unit = residuals.norm() / math.sqrt(len(residuals) - len(zero))
+    return (scores - zero) / unit, (kl_coef / unit).item()
+
+
+_OWN = (
+    "The statistics are of the scores that are converted: every batch of PPO gets a unit of its own, and progress has mean 0. Take those of"
+    " reference_scores."
+)
+_WRONG_IN_REFERENCE_UNITS = {
+    "kl-coef-unchanged": (
+        _converted(weight=lambda b, u: b),
+        "β is in units of score per nat, and the unit is another one now: with the old number the optimum is another policy.",
+    ),
+    "kl-coef-multiplied": (
+        _converted(weight=lambda b, u: b * u),
+        "The optimum rests on score / β alone. The scores were divided by the unit, so β has to be divided, too.",
+    ),
+    "kl-coef-by-the-variance": (
+        _converted(weight=lambda b, u: b / u**2),
+        "β is divided by a variance and the scores by a deviation: score / β is not what it was.",
+    ),
+    "scores-by-the-variance": (
+        _converted(unit=lambda s, r: r.var(1).mean()),
+        "This divides by the variance: the unit is its square root.",
+    ),
+    "own-statistics": (_converted(lambda s, r: s.mean(1, keepdim=True), lambda s, r: s.var(1).mean().sqrt()), _OWN),
+    "own-zero": (
+        _converted(zero=lambda s, r: s.mean(1, keepdim=True)),
+        "The zero is the mean of the scores that are converted, so a better policy looks no better: take the mean of reference_scores.",
+    ),
+    "own-unit": (
+        _converted(unit=lambda s, r: s.var(1).mean().sqrt()),
+        "The unit is the deviation of the scores that are converted, and moves with the policy: take that of reference_scores.",
+    ),
+    "both-together": (
+        _converted(
+            lambda s, r: torch.cat([s, r], 1).mean(1, keepdim=True), lambda s, r: torch.cat([s, r], 1).var(1).mean().sqrt()
+        ),
+        "Scores of both policies are in the statistics: those of reference_scores alone stay the same while the policy learns.",
+    ),
+    "zero-left": (
+        _converted(zero=lambda s, r: 0.0),
+        "Nothing is subtracted: each prompt's zero is the mean of the reference's scores there.",
+    ),
+    "one-zero-for-all-prompts": (
+        _converted(zero=lambda s, r: r.mean()),
+        "One mean for all prompts leaves in what no comparison has fixed, a constant for each prompt: take the mean along the last axis.",
+    ),
+    "deviation-over-everything": (
+        _converted(unit=lambda s, r: r.std()),
+        "This deviation also holds how far prompts' means lie apart, which no comparison has fixed: add a constant to one prompt's"
+        " scores, and β' changes. Take the deviation within prompts.",
+    ),
+    "whitened-over-everything": (
+        _converted(lambda s, r: r.mean(), lambda s, r: r.std()),
+        "One mean and one deviation over all prompts: both hold how far prompts lie apart, which no comparison has fixed.",
+    ),
+    "a-unit-for-each-prompt": (
+        _converted(unit=lambda s, r: r.std(1, keepdim=True)),
+        "With a unit for each prompt no single β' keeps the optimum: it takes one number for all prompts.",
+    ),
+    "mean-of-the-deviations": (
+        _converted(unit=lambda s, r: r.std(1).mean()),
+        "Average the prompts' variances and take the root then: the mean of the deviations is smaller.",
+    ),
+    "biased-deviation": (
+        _converted(unit=lambda s, r: r.var(1, correction=0).mean().sqrt()),
+        "Each prompt's squares are divided by k: its mean was estimated from the same k scores, so divide by k - 1.",
+    ),
+    "one-mean-counted": (
+        _converted(unit=lambda s, r: ((r - r.mean(1, keepdim=True)).square().sum() / (r.numel() - 1)).sqrt()),
+        "The squares are divided by B k - 1, as if one mean had been estimated: it was one for each prompt, so B (k - 1).",
+    ),
+    "small-number-added": (
+        _converted(unit=lambda s, r: r.var(1).mean().sqrt() + 1e-8),
+        "A small number is added to the deviation: small against which unit? Scores that are small themselves come out wrong.",
+    ),
+    "mean-added": (
+        _converted(zero=lambda s, r: -r.mean(1, keepdim=True)),
+        "The reference's mean is added: it is the zero from which scores are counted, so subtract it.",
+    ),
+    "median": (
+        _converted(zero=lambda s, r: r.median(1, keepdim=True).values),
+        "The zero is the median of the reference's scores: the mean is asked for.",
+    ),
+    "kl-coef-as-tensor": (
+        lambda s, r, b: (_converted()(s, r, b)[0], b / r.var(1).mean().sqrt()),
+        "β' is a setting: a Python float is asked for.",
+    ),
+}
+
+IN_REFERENCE_UNITS = Exercise(
+    name="in_reference_units",
+    reference=ch96.in_reference_units,
+    criteria={"values": 1.4, "gradient": 0.25, "dtype": 0.1, "inputs": 0.05, "errors": 0.2},
+    axes=("prompt", "text"),
+    cases=drawn_once(
+        Case("four prompts", _of_two_policies(), closed_form=_units_by_numpy, visible=True, draws=3),
+        Case("one prompt", _of_two_policies(1, 6), closed_form=_units_by_numpy, visible=True),
+        Case("one text to each prompt", _of_two_policies(n=1), closed_form=_units_by_numpy),
+        Case("two texts of the reference", _of_two_policies(6, k=2), closed_form=_units_by_numpy, visible=True),
+        Case("prompts far apart", _of_two_policies(apart=100.0), closed_form=_units_by_numpy, visible=True),
+        Case("scores of the size of 1e-9", _of_two_policies(size=1e-9, kl_coef=1e-10), closed_form=_units_by_numpy, visible=True),
+        Case("scores of thousands", _of_two_policies(size=4000.0, kl_coef=150.0), closed_form=_units_by_numpy),
+        Case("in that unit already", _in_that_unit_already, closed_form=lambda scores, kl_coef, **_rest: (scores, kl_coef)),
+        Case("the reference's own texts", _own_texts, closed_form=_units_by_numpy),
+        Case("one prompt of equal scores", _one_of_equals, closed_form=_units_by_numpy),
+        Case("kl_coef = 0", _of_two_policies(kl_coef=0.0), closed_form=_units_by_numpy),
+        Case("scores that require gradient", _of_two_policies(), differentiate=["scores"], visible=True),
+        Case("both require gradient", _of_two_policies(), differentiate=_ALL_OF_TWO_POLICIES, visible=True, draws=2),
+        Case("single precision", _of_two_policies(), dtype=torch.float32, visible=True),
+        *shape_cases(_of_two_policies(), _ALL_OF_TWO_POLICIES),
+        Case("one text of the reference", _of_two_policies(k=1), raises=["reference_scores"], visible=True),
+        Case("all of the reference's scores equal", _all_equal, raises=["reference_scores"], visible=True),
+        refused(_of_two_policies(), kl_coef=-0.1),
+    ),
+    misconceptions=(
+        *wrong(_WRONG_IN_REFERENCE_UNITS, _in_units),
+        Misconception(
+            "gradient-into-the-statistics",
+            _in_units(_converted(), leak=True),
+            "Gradient flows into the reference's scores: its statistics are constants, so detach them.",
+        ),
+        Misconception("cut-from-graph", after(ch96.in_reference_units, lambda pair: (pair[0].detach(), pair[1])), CUT),
+        Misconception("dtype-lost", after(ch96.in_reference_units, lambda pair: (pair[0].float(), pair[1])), DTYPE),
+        in_place(ch96.in_reference_units, "scores"),
+        bad_input_accepted(_in_units(rows_cut(_converted()), checked=False)),
+    ),
+    variants={
+        "NumPy for the statistics": _in_units(
+            lambda s, r, b: (
+                (s - torch.from_numpy(r.numpy().mean(1, keepdims=True))) / float(np.sqrt(r.numpy().var(1, ddof=1).mean())),
+                b / float(np.sqrt(r.numpy().var(1, ddof=1).mean())),
+            )
+        ),
+        "prompt by prompt": _in_units(_prompt_by_prompt),
+        "differences of pairs": _in_units(_by_pairs),
+        "residuals": _in_units(_by_residuals),
+        "standard deviations squared": _in_units(_converted(unit=lambda s, r: r.std(1).square().mean().sqrt())),
     },
 )
 
@@ -705,4 +942,12 @@ REPAIRED_CHOICES = Exercise(
     },
 )
 
-EXERCISES = (LAST_TOKEN_SCORES, REWARD_MODEL_LOSS, BEST_OF_N, BEST_OF_N_KL, LENGTH_CORRELATION, REPAIRED_CHOICES)
+EXERCISES = (
+    LAST_TOKEN_SCORES,
+    REWARD_MODEL_LOSS,
+    IN_REFERENCE_UNITS,
+    BEST_OF_N,
+    BEST_OF_N_KL,
+    LENGTH_CORRELATION,
+    REPAIRED_CHOICES,
+)

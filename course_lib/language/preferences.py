@@ -179,6 +179,25 @@ def ask_two_raters(preferences: Preferences, generator: torch.Generator) -> Pref
     return preferences.swapped(draws < preferences.disagreement)
 
 
+def told_differences(preferences: Preferences, snippets: Snippets, generator: torch.Generator) -> torch.Tensor:
+    """By how many points the two people differed who gave each answer: drawn from all pairs of raters who would have given it.
+
+        P(a - b | chosen ≻ rejected),   (a, b) with weight 1 where a > b, and 1/2 where a = b: a coin had decided
+
+    Args:
+      preferences: answers that two raters of `snippets` can have given, as `ask_two_raters` makes them; B of them.
+      snippets: the texts, in the order of preferences.texts.
+      generator: of the draws.
+
+    Returns: (B,) float32, from 0 to HIGHEST - LOWEST.
+    """
+    scores = torch.arange(LOWEST, HIGHEST + 1)
+    points = scores[:, None] - scores[None, :]  # (K, K): of the chosen text's rater less the other's
+    chosen, rejected = snippets.frequencies[preferences.chosen], snippets.frequencies[preferences.rejected]  # (B, K) each
+    weights = chosen[:, :, None] * rejected[:, None, :] * torch.where(points > 0, 1.0, torch.where(points == 0, 0.5, 0.0))
+    return points.flatten()[torch.multinomial(weights.flatten(1), 1, generator=generator).squeeze(1)].float()
+
+
 def flip_labels(preferences: Preferences, rate: float, generator: torch.Generator) -> Preferences:
     """Careless labels: each pair is turned round with probability `rate`, whatever the texts.
 

@@ -19,7 +19,7 @@ from course_lib.language.preferences import Preferences
 from course_lib.seeding import seed_everything
 
 PAIRS = 8192  # neighbouring tokens are known by a hash
-Loss = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]  # of chosen and rejected scores, (B,) each
+Loss = Callable[..., torch.Tensor]  # of chosen and rejected scores and, where there are margins, of these; (B,) each
 LastTokenScores = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 
 
@@ -69,8 +69,11 @@ def fit(
     batch: int = 64,
     learning_rate: float = 2e-3,
     weight_decay: float = 3.0,
+    margins: torch.Tensor | None = None,
 ) -> RewardModel:
     """Minimise `loss` of chosen and rejected scores over minibatches of comparisons, with a learning rate that falls to 0.
+
+    `margins`, one for each comparison, are handed to `loss` as its third argument.
 
     Returns: the model, frozen: nothing that uses it may train it by accident.
     """
@@ -86,7 +89,7 @@ def fit(
         here = Tokens(tokens.input_ids[rows, :width], tokens.attention_mask[rows, :width])
         chosen, rejected = last_token_scores(model(*here), here.attention_mask).split(batch)
         optimizer.zero_grad()
-        loss(chosen, rejected).backward()
+        (loss(chosen, rejected) if margins is None else loss(chosen, rejected, margins[picks])).backward()
         optimizer.step()
         schedule.step()
     return model.requires_grad_(False).eval()

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from course_lib.control import sac
 from course_lib.control.replay import Transitions
 from solutions import ch47
-from solutions.ch48 import bootstrap_interval, fast_sac_update, interquartile_mean, steps_to_threshold
+from solutions.ch48 import bootstrap_interval, fast_sac_update, interquartile_mean, race_counts, steps_to_threshold
 
 TAUGHT = sac.Taught.of(vars(ch47))
 SMALL = sac.SACSettings(total_steps=300, learning_starts=50, batch_size=16, hidden=8)
@@ -81,6 +81,57 @@ def test_a_higher_threshold_is_never_reached_earlier(returns, threshold, more):
 def test_steps_to_threshold_refuses_what_does_not_fit(steps, returns, name):
     with pytest.raises(ValueError, match=name):
         steps_to_threshold(torch.tensor(steps), torch.tensor(returns), 1)
+
+
+NEVER = torch.inf
+
+
+@pytest.mark.parametrize(
+    ("ours", "our_ends", "theirs", "their_ends", "expected"),
+    [
+        ([80.0], [200], [NEVER], [100], (1, 0, 0)),  # theirs was seen below the line at 100
+        ([150.0], [200], [NEVER], [100], (0, 0, 1)),  # theirs may have crossed at 110
+        ([100.0], [200], [NEVER], [100], (1, 0, 0)),  # seen below the line at that very step
+        ([NEVER], [100], [80.0], [200], (0, 1, 0)),
+        ([NEVER], [100], [NEVER], [200], (0, 0, 1)),
+        ([150.0], [200], [90.0], [100], (0, 1, 0)),  # both crossed: no end is asked
+        ([80.0], [100], [80.0], [200], (0, 0, 1)),  # a tie
+        ([80.0, NEVER], [100, 50], [90.0, NEVER, 70.0], [100, 60, 100], (1, 1, 4)),
+    ],
+)
+def test_race_counts_by_hand(ours, our_ends, theirs, their_ends, expected):
+    columns = [torch.tensor(column, dtype=torch.float64) for column in (ours, our_ends, theirs, their_ends)]
+    assert tuple(count.item() for count in race_counts(*columns)) == expected
+    exchanged = race_counts(*columns[2:], *columns[:2])
+    assert tuple(count.item() for count in exchanged) == (expected[1], expected[0], expected[2])
+
+
+RUNS = st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), min_size=1, max_size=6)
+
+
+@given(RUNS, RUNS, st.integers(0, 9))
+@settings(max_examples=100, deadline=None)
+def test_what_is_decided_agrees_with_the_truth_and_stays_when_all_are_watched_for_longer(ours, theirs, longer):
+    def watched(runs, more=0):
+        crossings, ends = torch.tensor(runs, dtype=torch.float64).T
+        ends = ends + more
+        return torch.where(crossings <= ends, crossings, NEVER), ends
+
+    won, lost, undecided = race_counts(*watched(ours), *watched(theirs))
+    later = race_counts(*watched(ours, longer), *watched(theirs, longer))
+    truth = race_counts(*watched(ours, 10), *watched(theirs, 10))
+    assert won <= later[0] <= truth[0] and lost <= later[1] <= truth[1]
+    assert won + lost + undecided == len(ours) * len(theirs)
+    assert truth[2] == sum(a == b for a, _ in ours for b, _ in theirs)  # ties only
+
+
+@pytest.mark.parametrize(
+    ("ours", "our_ends", "theirs", "their_ends", "name"),
+    [([2.0], [1.0], [1.0], [1.0], "ours"), ([1.0], [1.0], [2.0], [1.0], "theirs"), ([1.0, 1], [1.0], [1.0], [1.0], "our_ends")],
+)
+def test_race_counts_refuses_what_does_not_fit(ours, our_ends, theirs, their_ends, name):
+    with pytest.raises(ValueError, match=name):
+        race_counts(*map(torch.tensor, (ours, our_ends, theirs, their_ends)))
 
 
 def random_steps(size=32, seed=0):

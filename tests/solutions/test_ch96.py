@@ -5,7 +5,16 @@ import math
 import pytest
 import torch
 
-from solutions.ch96 import best_of_n, best_of_n_kl, last_token_scores, length_correlation, repaired_choices, reward_model_loss
+from solutions.ch96 import (
+    best_of_n,
+    best_of_n_kl,
+    in_reference_units,
+    last_token_scores,
+    length_correlation,
+    repaired_choices,
+    reward_model_loss,
+)
+from solutions.ch97 import kl_optimal_policy
 
 
 def row(*numbers, dtype=torch.float64):
@@ -58,6 +67,45 @@ def test_a_margin_receives_no_gradient():
     margin = row(0.5).requires_grad_()
     reward_model_loss(row(1.0).requires_grad_(), row(0.0), margin).backward()
     assert margin.grad is None
+
+
+def test_reference_units_by_hand():
+    converted, kl_coef = in_reference_units(row([5, 9], [-7, -3]), row([1, 3, 5], [-13, -7, -1]), 0.1)
+    unit = math.sqrt((4 + 36) / 2)
+    torch.testing.assert_close(converted, row([2, 6], [0, 4]) / unit)
+    assert kl_coef == pytest.approx(0.1 / unit) and isinstance(kl_coef, float)
+
+
+def test_the_optimum_is_the_same_policy_in_either_unit():
+    ref_probs = torch.randn(3, 7, dtype=torch.float64).softmax(-1)
+    scores = 4 * torch.randn(3, 7, dtype=torch.float64) + row([100], [0], [-20])
+    drawn = scores.gather(1, ref_probs.multinomial(50, replacement=True))
+    converted, kl_coef = in_reference_units(scores, drawn, 0.7)
+    optimum = kl_optimal_policy(ref_probs, scores, 0.7)
+    torch.testing.assert_close(kl_optimal_policy(ref_probs, converted, kl_coef), optimum)
+    assert (kl_optimal_policy(ref_probs, converted, 0.7) - optimum).abs().max() > 0.1
+
+
+def test_what_comparisons_cannot_fix_changes_no_reference_unit():
+    scores, reference = torch.randn(4, 3, dtype=torch.float64), torch.randn(4, 6, dtype=torch.float64)
+    of_prompt = 10 * torch.randn(4, 1, dtype=torch.float64)
+    before = in_reference_units(scores, reference, 0.05)
+    after = in_reference_units(3 * scores + of_prompt, 3 * reference + of_prompt, 3 * 0.05)
+    torch.testing.assert_close(after[0], before[0])
+    assert after[1] == pytest.approx(before[1])
+
+
+def test_a_batch_that_is_the_reference_s_own_still_receives_gradient_as_data_does():
+    scores = torch.randn(2, 5, dtype=torch.float64, requires_grad=True)
+    converted, _ = in_reference_units(scores, scores, 1.0)
+    (gradient,) = torch.autograd.grad(converted.sum(), scores)
+    torch.testing.assert_close(gradient, torch.full_like(gradient, 1 / scores.var(1).mean().sqrt().item()))
+
+
+@pytest.mark.parametrize("reference", [row([1], [2]), row([1, 1], [3, 3])])
+def test_reference_scores_without_a_deviation_are_refused(reference):
+    with pytest.raises(ValueError, match="reference_scores"):
+        in_reference_units(row([1, 2], [3, 4]), reference, 0.1)
 
 
 def test_the_best_of_n_by_hand():

@@ -94,6 +94,21 @@ def test_single_raters_turn_round_as_many_pairs_as_raters_disagree():
     torch.testing.assert_close(asked.disagreement[turned], 1 - drawn.disagreement[turned])
 
 
+def test_what_two_raters_told_is_what_the_pair_s_raters_say_given_who_won():
+    texts = snippets([-1, 2, 4], [0, 2])
+    answers = preferences.Preferences(
+        texts.texts,
+        torch.zeros(20_000, dtype=torch.int64),
+        torch.ones(20_000, dtype=torch.int64),
+        torch.zeros(20_000),
+        torch.zeros(20_000),
+    )
+    told = preferences.told_differences(answers, texts, torch.Generator().manual_seed(0))
+    # (2, 0), (4, 0), (4, 2) win outright; (2, 2) by a coin
+    shares = [(told == points).float().mean().item() for points in (0, 2, 4)]
+    assert shares == pytest.approx([0.5 / 3.5, 2 / 3.5, 1 / 3.5], abs=0.02) and set(told.tolist()) == {0.0, 2.0, 4.0}
+
+
 def test_careless_labels_are_turned_round_at_the_given_rate():
     generator = torch.Generator().manual_seed(0)
     drawn = preferences.draw_pairs(preferences.load("reward_model"), 20_000, generator)

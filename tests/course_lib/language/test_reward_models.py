@@ -35,3 +35,15 @@ def test_it_learns_what_comparisons_say_and_is_frozen_afterwards(tiny):
     model = fit(RewardModel(tiny), data, reward_model_loss, last_token_scores, seed=0, steps=100, batch=4)
     scores = model.scores(texts, last_token_scores)
     assert scores[::2].min() > scores[1::2].max() and not any(parameter.requires_grad for parameter in model.parameters())
+
+
+def test_each_comparison_is_learnt_with_its_own_margin(tiny):
+    texts, seen = ["good film", "bad film", "good plot", "bad plot"], []
+    data = preferences.Preferences(texts, torch.tensor([0, 2]), torch.tensor([1, 3]), torch.zeros(2), torch.ones(2))
+
+    def loss(chosen, rejected, margin):
+        seen.append((chosen - rejected - margin).detach())
+        return reward_model_loss(chosen, rejected, margin)
+
+    fit(RewardModel(tiny), data, loss, last_token_scores, seed=0, steps=100, batch=8, margins=torch.tensor([0.0, 50.0]))
+    assert ((seen[0] < -40).any() and (seen[0] > -10).any()) and len(seen) == 100

@@ -6,7 +6,7 @@ import torch
 from course_lib.language import lm, preferences
 from course_lib.language.reward_models import RewardModel
 from course_lib.language.rlhf import Proxy, liked_texts, next_token_loss, supervised, whole_texts
-from solutions.ch96 import last_token_scores
+from solutions.ch96 import in_reference_units, last_token_scores
 
 
 @pytest.fixture(scope="module")
@@ -25,6 +25,12 @@ def test_a_calibrated_proxy_has_mean_0_and_deviation_1_there_and_keeps_its_order
     assert calibrated(samples).mean().item() == pytest.approx(0, abs=1e-5)
     assert calibrated(samples).std().item() == pytest.approx(1, abs=1e-4)
     assert torch.equal(calibrated(samples).argsort(), proxy(samples).argsort())
+
+
+def test_a_calibrated_proxy_is_in_reference_units_of_one_prompt(tiny, samples):
+    proxy = Proxy(RewardModel(tiny, seed=2), last_token_scores)
+    raw = proxy(samples)[None]
+    torch.testing.assert_close(proxy.calibrated(samples)(samples)[None], in_reference_units(raw, raw, 0.05)[0])
 
 
 def test_judges_read_prompts_and_completions(tiny, samples):
