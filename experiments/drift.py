@@ -16,7 +16,10 @@ from course_lib.language.fine_tuning import Writer, openings, train
 from experiments import sentiment
 from experiments.campaign import Report, Result
 
-VARIANTS: dict[str, dict[str, Any]] = {"large_steps": sentiment.BASE | {"spread": 0.34}}
+VARIANTS: dict[str, dict[str, Any]] = {
+    "large_steps": sentiment.BASE | {"spread": 0.34},
+    "small_steps": sentiment.BASE | sentiment.PATIENT | {"spread": 0.34},
+}
 SEEDS = 3
 
 

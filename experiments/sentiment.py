@@ -26,6 +26,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "kl_0.0_long": BASE | {"kl_coef": 0.0, "iterations": 80},
     "patient": BASE | PATIENT,
     **{f"patient_{kl_coef}": BASE | PATIENT | {"kl_coef": kl_coef} for kl_coef in (0.05, 0.2, 0.0)},
+    "whole_credit_0.05": BASE | {"kl_coef": 0.05, "gae_lambda": 1.0},
     "lab_suspect": BASE | {"rewards": "whitened"},
     "lab_repaired": BASE | {"rewards": "scaled"},
     "per_text": BASE | {"rewards": "penalty averaged over the text", "kl_coef": 1.0},
