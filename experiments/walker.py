@@ -1,9 +1,10 @@
 """SAC on Walker2d with Spinning Up's settings for it, and with each of them put back to chapter 48's: which of them makes the difference.
 
-The four settings in which Spinning Up's SAC departs from experiments/control.py are its learning rate, its fixed temperature, its
-minibatches of 100 and its updates from step 1,000 on, while actions are still drawn evenly: https://spinningup.openai.com/en/latest/algorithms/sac.html.
-`published` has all four, `without_NAME` all but one, `only_NAME` that one alone. Its updates in blocks of 50, as many as steps, are
-here one after each step. Protocol and rows are those of experiments/control.py, where the settings with none of the four are `sac_walker2d`.
+The four settings in which Spinning Up's SAC, https://spinningup.openai.com/en/latest/algorithms/sac.html, departs from
+experiments/control.py are its learning rate, its fixed temperature, its minibatches of 100 and its updates from step 1,000 on, while
+actions are still drawn evenly. `published` has all four, `without_NAME` all but one, `only_NAME` that one alone. Its updates in blocks of
+50, as many as steps, are here one after each step. Protocol and rows are those of experiments/control.py, where the settings with none of
+the four are `sac_walker2d`.
 """
 
 from __future__ import annotations
