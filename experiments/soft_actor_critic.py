@@ -2,9 +2,10 @@
 
 A variant is `reference`, the setting `sac` of experiments/sensitivity.py, or the same with one change: a single critic is asked, the
 temperature is fixed, the slow copies are copied at once, the buffer forgets; rewards are multiplied by a number, once with the
-temperature's loss of Stable-Baselines3, log α in place of α (`rewards_0.01_log_alpha`). `ratio_5` makes five updates after each step, `one_critic_5` does so with a single critic, and `redq_5` is the sibling that is made for it, of Chen et al.
-(2021), algorithm 1, https://arxiv.org/abs/2101.05982: ten critics, of which two drawn at random make a target, and one step of the policy,
-against the mean of all ten, after five of the critics.
+temperature's loss of Stable-Baselines3, log α in place of α (`rewards_0.01_log_alpha`). `ratio_5` makes five updates after each step,
+`one_critic_5` does so with a single critic, and `redq_5` is the sibling that is made for it, of Chen et al. (2021), algorithm 1,
+https://arxiv.org/abs/2101.05982: ten critics, of which two drawn at random make a target, and one step of the policy, against the mean of
+all ten, after five of the critics.
 
 Policies are evaluated as in experiments/control.py. Beside that, each evaluation plays ten episodes with the policy's own noise:
 `predicted` is what the critics say of the first hundred actions of each, as the policy is told it, and `realised` the discounted soft
