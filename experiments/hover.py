@@ -44,6 +44,8 @@ PARTS: dict[str, Mapping[str, float]] = {
     "value_loss_0.05": {"vf_coef": 0.05},
     "value_loss_5": {"vf_coef": 5.0},
     "no_norm_bound": {"max_grad_norm": INFINITE},
+    "value_loss_0.05_no_norm_bound": {"vf_coef": 0.05, "max_grad_norm": INFINITE},
+    "value_loss_5_no_norm_bound": {"vf_coef": 5.0, "max_grad_norm": INFINITE},
     "fast_no_clip": FAST | {"clip_range": INFINITE},
     "fast_target_kl": FAST | {"clip_range": INFINITE, "target_kl": 0.02},
 }

@@ -1,10 +1,11 @@
 """SAC on Pendulum with one part taken away or changed, and what its critics believe beside what their actions bring.
 
 A variant is `reference`, the setting `sac` of experiments/sensitivity.py, or the same with one change: a single critic is asked, the
-temperature is fixed, the slow copies are copied at once, the buffer forgets; rewards are multiplied by a number. `ratio_5` makes five
-updates after each step, `one_critic_5` does so with a single critic, and `redq_5` is the sibling that is made for it, of Chen et al.
-(2021), algorithm 1, https://arxiv.org/abs/2101.05982: ten critics, of which two drawn at random make a target, and one step of the policy,
-against the mean of all ten, after five of the critics.
+temperature is fixed, the slow copies are copied at once, the buffer forgets; rewards are multiplied by a number, once with the
+temperature's loss of Stable-Baselines3, log α in place of α (`rewards_0.01_log_alpha`). `ratio_5` makes five updates after each step,
+`one_critic_5` does so with a single critic, and `redq_5` is the sibling that is made for it, of Chen et al. (2021), algorithm 1,
+https://arxiv.org/abs/2101.05982: ten critics, of which two drawn at random make a target, and one step of the policy, against the mean of
+all ten, after five of the critics.
 
 Policies are evaluated as in experiments/control.py. Beside that, each evaluation plays ten episodes with the policy's own noise:
 `predicted` is what the critics say of the first hundred actions of each, as the policy is told it, and `realised` the discounted soft
@@ -49,6 +50,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "redq_5": {"updates": 5, "asked": "mean of ten"},
     "lab_suspect": {"follow": "by masks"},
     **{f"rewards_{scale:g}": {"reward_scale": scale} for scale in SCALES},
+    "rewards_0.01_log_alpha": {"reward_scale": 0.01, "priced": "log alpha"},
 }
 OURS = {"asked": "smaller of two", "adapts": True, "updates": 1}  # what SACSettings does not have
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -71,6 +73,15 @@ def first_alone() -> sac.Taught:
         return TAUGHT.sac_actor_loss(q1, q1, log_probs, alpha)
 
     return replace(TAUGHT, soft_q_target=target, sac_actor_loss=actor_loss)
+
+
+def by_log_alpha() -> sac.Taught:
+    """The functions of the chapter, but for the temperature's loss, which multiplies by log α, as in Stable-Baselines3."""
+
+    def loss(log_alpha, log_probs, target_entropy):
+        return -(log_alpha * (log_probs.detach() + target_entropy)).mean()
+
+    return replace(TAUGHT, temperature_loss=loss)
 
 
 def by_masks(first: torch.Tensor) -> sac.Taught:
@@ -170,6 +181,8 @@ def made(variant: str, seed: int) -> tuple[sac.Training, Callable]:
     training = kind(env, settings, seed, first_alone() if alone else TAUGHT)
     if not changes["adapts"]:
         training.agent.temperature_optimizer.learning_rate = 0.0
+    if "priced" in changes:
+        training.taught = by_log_alpha()
     if "follow" in changes:
         weights = len(training.agent.targets.weights)
         training.taught = by_masks(torch.arange(weights) < weights // 2)
