@@ -1,9 +1,10 @@
 """GRPO on sorting digits with a model of 100,000 parameters, and what may stand in its place (chapter 101).
 
-Baselines, a critic, supervised learning, difficulty, a verifier with a hole, a silent bug, room for long answers, and bounds on the ratio
-with the entropy that is left. A run's seed is that of the model, of its warm-up and of training. Every iteration of every variant asks
-the verifier about 192 answers; a row stands for ten iterations unless "rows" says otherwise. In some of them the policy is measured on
-prompts whose answers were never asked for in training.
+Baselines, a critic, supervised learning, sampling at lower temperatures, difficulty, the division by a group's deviation, groups that are
+none, a verifier with a hole, a silent bug, room for long answers, and bounds on the ratio with the entropy that is left. A run's seed is
+that of the model, of its warm-up and of training. Every iteration of every variant asks the verifier about 192 answers; a row stands for
+ten iterations unless "rows" says otherwise. In some of them the policy is measured on prompts whose answers were never asked for in
+training.
 """
 
 from __future__ import annotations
@@ -49,6 +50,12 @@ VARIANTS: dict[str, dict] = {
     "clip_higher": PASSES | {"clip_low": 0.2, "clip_high": 0.28},
     "clip_tight": PASSES | {"clip_low": 0.2, "clip_high": 0.02},
     "clip_above": PASSES | {"clip_low": 1e6, "clip_high": 0.28},  # no bound below
+    "clip_once": PASSES | {"epochs": 1},
+    "cold": COMMON | {"colder": [0.5, 0.3]},  # the run "grpo" again, looked at once more before and after it
+    "cold_ppo": COMMON | {"method": "ppo", "colder": [0.5, 0.3]},
+    "mixed_group": MIXED,
+    "mixed_none": MIXED | {"scale": "none"},
+    "mixed_ungrouped": MIXED | {"ungrouped": True},
     **{f"digits_{n}": COMMON | {"digits": [n], "room": n + 3, "iterations": 0} for n in (4, 5, 6, 7)},
 }
 SEEDS = 5
@@ -88,6 +95,20 @@ class Watched(Learner):
         mask = completion_mask(samples.input_ids, samples.prompt_lengths, self.end_id)[:, 1:]
         self.entropy = masked_mean(-(logps.exp() * logps).sum(-1), mask).item()
         return samples
+
+
+def all_then_again(prompts: list[str], size: int) -> list[str]:
+    """Prompts of which each stands `size` times in a row, as `prompts * size` has them: every one, then every one again."""
+    return prompts[::size] * size
+
+
+class Ungrouped(Learner):
+    """A learner that answers in the order of `all_then_again`: answers that are compared are to different prompts."""
+
+    size: int
+
+    def generate(self, prompts, max_new_tokens, generator=None):
+        return super().generate(all_then_again(prompts, self.size), max_new_tokens, generator)
 
 
 def ppo(policy: lm.LanguageModel, seed: int, settings: GroupSettings, with_critic: bool = True) -> Callable:
@@ -158,12 +179,17 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
         policy, seed, settings, with_critic=method == "ppo"
     )
     asks = answers if method in ("ppo", "no_critic", "supervised") else settings.prompts
-    learner = (Watched if choice.get("watched") else Learner)(policy, settings.learning_rate)
+    kind = Watched if choice.get("watched") else Ungrouped if choice.get("ungrouped") else Learner
+    learner = kind(policy, settings.learning_rate)
+    if isinstance(learner, Ungrouped):
+        learner.size = settings.group_size
     span = choice.get("rows", ROWS)
     generator = seed_everything(100 + seed)
     seen: list[dict[str, float]] = []
 
     def verify(prompts, completions):
+        if isinstance(learner, Ungrouped):
+            prompts = all_then_again(prompts, learner.size)
         rewards, right = pays(prompts, completions), verify_sorted(prompts, completions)
         sizes = torch.tensor([len(prompt) - 1 for prompt in prompts])
         lengths = torch.tensor([float(len(text)) for text in completions])
@@ -177,15 +203,25 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
         )
         return rewards
 
-    def look(prompts: int) -> dict[str, float]:
+    def look(prompts: int, temperature: float = 1.0) -> dict[str, float]:
         found: dict[str, float] = {}
         for number in sorted(set(digits)):
             kind = f"_{number}" if len(digits) > 1 else ""
-            told = measured(policy, verify_sorted, pass_at_k, seed_everything(10_000 + seed), (number,), prompts, room=room)
+            drawn = seed_everything(10_000 + seed)
+            told = measured(policy, verify_sorted, pass_at_k, drawn, (number,), prompts, room=room, temperature=temperature)
             found |= {f"held_out_{name}{kind}": value for name, value in told.items()}
         return found
 
+    def look_colder(when: str) -> dict[str, float]:
+        """The held-out measurements at each lower temperature, such as "before_pass_1_at_0.5"."""
+        return {
+            f"{when}_{name.removeprefix('held_out_')}_at_{temperature}": value
+            for temperature in choice.get("colder", ())
+            for name, value in look(96, temperature).items()
+        }
+
     before = look(96)
+    colder = look_colder("before")
     rows = [{"iteration": 0, "answers": 0, "seconds": 0.0, **before}]
     if not iterations:
         asked = [prompt for prompt in questions(200, generator, digits) for _ in range(16)]
@@ -215,6 +251,7 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
             report(done, iterations)
     final = {name: value for name, value in rows[-1].items() if name.startswith("held_out")}
     summary = final | {f"before_{name.removeprefix('held_out_')}": value for name, value in before.items()}
+    summary |= colder | look_colder("held_out")
     asked = questions(6, seed_everything(20_000 + seed), digits, held_out=True)
     written = policy.generate(asked, room, generator=seed_everything(seed)).texts
     shown = [{"prompt": prompt, "text": text} for prompt, text in zip(asked, written, strict=True)]
