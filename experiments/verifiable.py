@@ -1,9 +1,9 @@
 """GRPO on sorting digits with a model of 100,000 parameters, and what may stand in its place (chapter 101).
 
-Baselines, a critic, supervised learning, difficulty, a verifier with a hole, a silent bug, room for long answers, and bounds on the ratio
-with the entropy that is left. A run's seed is that of the model, of its warm-up and of training. Every iteration of every variant asks
-the verifier about 192 answers; a row stands for ten iterations unless "rows" says otherwise. In some of them the policy is measured on
-prompts whose answers were never asked for in training.
+Baselines, a critic, supervised learning, sampling at lower temperatures, difficulty, the division by a group's deviation, a verifier with
+a hole, a silent bug, room for long answers, and bounds on the ratio with the entropy that is left. A run's seed is that of the model, of
+its warm-up and of training. Every iteration of every variant asks the verifier about 192 answers; a row stands for ten iterations unless
+"rows" says otherwise. In some of them the policy is measured on prompts whose answers were never asked for in training.
 """
 
 from __future__ import annotations
@@ -49,6 +49,9 @@ VARIANTS: dict[str, dict] = {
     "clip_higher": PASSES | {"clip_low": 0.2, "clip_high": 0.28},
     "clip_tight": PASSES | {"clip_low": 0.2, "clip_high": 0.02},
     "clip_above": PASSES | {"clip_low": 1e6, "clip_high": 0.28},  # no bound below
+    "cold": COMMON | {"colder": [0.5, 0.3]},  # the run "grpo" again, looked at once more before and after it
+    "mixed_group": MIXED,
+    "mixed_none": MIXED | {"scale": "none"},
     **{f"digits_{n}": COMMON | {"digits": [n], "room": n + 3, "iterations": 0} for n in (4, 5, 6, 7)},
 }
 SEEDS = 5
@@ -177,15 +180,25 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
         )
         return rewards
 
-    def look(prompts: int) -> dict[str, float]:
+    def look(prompts: int, temperature: float = 1.0) -> dict[str, float]:
         found: dict[str, float] = {}
         for number in sorted(set(digits)):
             kind = f"_{number}" if len(digits) > 1 else ""
-            told = measured(policy, verify_sorted, pass_at_k, seed_everything(10_000 + seed), (number,), prompts, room=room)
+            drawn = seed_everything(10_000 + seed)
+            told = measured(policy, verify_sorted, pass_at_k, drawn, (number,), prompts, room=room, temperature=temperature)
             found |= {f"held_out_{name}{kind}": value for name, value in told.items()}
         return found
 
+    def look_colder(when: str) -> dict[str, float]:
+        """The held-out measurements at each lower temperature, such as "before_pass_1_at_0.5"."""
+        return {
+            f"{when}_{name.removeprefix('held_out_')}_at_{temperature}": value
+            for temperature in choice.get("colder", ())
+            for name, value in look(96, temperature).items()
+        }
+
     before = look(96)
+    colder = look_colder("before")
     rows = [{"iteration": 0, "answers": 0, "seconds": 0.0, **before}]
     if not iterations:
         asked = [prompt for prompt in questions(200, generator, digits) for _ in range(16)]
@@ -215,6 +228,7 @@ def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result
             report(done, iterations)
     final = {name: value for name, value in rows[-1].items() if name.startswith("held_out")}
     summary = final | {f"before_{name.removeprefix('held_out_')}": value for name, value in before.items()}
+    summary |= colder | look_colder("held_out")
     asked = questions(6, seed_everything(20_000 + seed), digits, held_out=True)
     written = policy.generate(asked, room, generator=seed_everything(seed)).texts
     shown = [{"prompt": prompt, "text": text} for prompt, text in zip(asked, written, strict=True)]

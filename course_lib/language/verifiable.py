@@ -96,17 +96,18 @@ def measured(
     prompts: int = 96,
     samples: int = 16,
     room: int = ROOM,
+    temperature: float = 1.0,
 ) -> dict[str, float]:
-    """On held-out prompts, at temperature 1: pass@1, pass@4 and pass@16, characters of an answer; and how often the likeliest
-    answer is right ("greedy")."""
+    """On held-out prompts, sampled at a temperature: pass@1, pass@4 and pass@16, characters of an answer; and how often the answer is
+    right that takes the likeliest token each time ("greedy")."""
     asked = questions(prompts, generator, digits, held_out=True)
     rows = [prompt for prompt in asked for _ in range(samples)]
-    texts = policy.generate(rows, room, generator=generator).texts
+    texts = policy.generate(rows, room, temperature, generator).texts
     correct = verify(rows, texts).reshape(-1, samples).sum(1).long()
-    likeliest = policy.generate(asked, room, temperature=0.0).texts
+    greedy = policy.generate(asked, room, temperature=0.0).texts
     return {
         **{f"pass_{k}": pass_at_k(samples, correct, k).mean().item() for k in (1, 4, 16) if k <= samples},
-        "greedy": verify(asked, likeliest).mean().item(),
+        "greedy": verify(asked, greedy).mean().item(),
         "characters": sum(map(len, texts)) / len(texts),
     }
 
