@@ -70,9 +70,10 @@ def _draw(exercise: Exercise, seed: int, result: ExerciseRows) -> None:
     except freeze.FreezeError as error:
         result.failures.append(("no cases can be drawn", str(error), seed))
         return
+    wrong = {mistake.name: mistake.function for mistake in exercise.misconceptions}
     for row in result.misconceptions:
-        # what a misconception does was observed when the case was frozen
-        finding = diagnose(frozen, [case.misconceptions[row.name] for case in frozen.cases])
+        # observed anew, as a learner's is: what was frozen would be named even if it never came again
+        finding = diagnose(frozen, [view(case, observe(wrong[row.name], **case.call)) for case in frozen.cases])
         rejected, named = finding.score < finding.max_score, finding.misconceptions == [row.name]
         row.rejected += rejected
         row.named += named

@@ -22,6 +22,10 @@ from course_lib.checks.telling import text_of
 
 MAX_ENTRIES = 10_000
 """Of an iterator that never ends, so many entries are taken."""
+OWN_DRAWS = 3_141_592_653_589_793
+"""Seeds torch's own generator before a function is called, so that what it draws there is the same whenever it is observed. No case
+seeds a generator with it: a function that should have drawn from that generator, and did not, is found out.
+"""
 
 
 def observe(
@@ -31,7 +35,7 @@ def observe(
     repeat: int = 1,
     returns: Sequence[str] = (),
 ) -> Observation:
-    """Call `function` on `arguments` and return what could be seen.
+    """Call `function` on `arguments` and return what could be seen. torch's own generator is seeded for it, and put back afterwards.
 
     Args:
       function: the exercise's function.
@@ -52,8 +56,9 @@ def observe(
     guarded = {name: value for name, value in given.items() if name not in returns}
     before = _copies(guarded)
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), torch.random.fork_rng(devices=[]):
             warnings.simplefilter("ignore")
+            torch.default_generator.manual_seed(OWN_DRAWS)
             results = [_taken_apart(_call(function, given)) for _ in range(repeat)]
     except Exception as error:
         return Observation(error=type(error).__name__, message=text_of(error), mutated=_changed(guarded, before))

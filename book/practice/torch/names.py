@@ -10,6 +10,7 @@ import inspect
 import math
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from types import ModuleType
 from typing import Any
 
@@ -155,6 +156,13 @@ class Generator:
 
     def __init__(self, device: str = "cpu") -> None:
         raise Missing("torch.Generator")
+
+    def manual_seed(self, seed: int) -> Generator:
+        return self
+
+
+_default_generator = object.__new__(Generator)  # nobody draws from it, so that a seed for it changes nothing
+random = Namespace("torch.random", fork_rng=lambda devices=None: nullcontext(), manual_seed=_default_generator.manual_seed)
 
 
 class device:
@@ -306,6 +314,9 @@ TORCH: dict[str, Any] = {
     **{name: getattr(autograd, name) for name in ("no_grad", "enable_grad", "inference_mode", "set_grad_enabled")},
     "is_grad_enabled": autograd.is_recording,
     "Generator": Generator,
+    "random": random,
+    "default_generator": _default_generator,
+    "manual_seed": random.manual_seed,
     "result_type": dtypes.result_type,
     "promote_types": dtypes.promoted,
     "broadcast_shapes": lambda *shapes: Size(broadcast_shapes(*shapes)),

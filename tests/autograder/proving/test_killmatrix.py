@@ -6,6 +6,7 @@ the header of the tests prints, repeats a day); one whose record does not fit is
 
 import functools
 import os
+import random
 
 import pytest
 import torch
@@ -103,6 +104,13 @@ def test_a_specification_that_contradicts_itself_is_told_and_not_raised():
     assert told == (
         "double: no cases can be drawn, in 1 of 1 draws. Seed 7: double, case 'a batch': the reference and the closed form differ"
     )
+
+
+def test_a_misconception_that_is_another_one_each_time_is_told():
+    told = killmatrix.report(killmatrix.exercise_rows(doubling([("never twice alike", lambda x: x * random.random())]), range(2)))
+    assert [line.partition(". Seed 0: ")[0] for line in told] == [
+        "double: misconception 'never twice alike' is misnamed: nothing is named, in 2 of 2 draws"
+    ]
 
 
 def test_parts_add_up_to_the_whole():

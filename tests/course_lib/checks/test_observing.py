@@ -147,3 +147,20 @@ def test_a_generators_state_can_be_looked_at():
     expected = torch.Generator().manual_seed(3)
     torch.rand(2, generator=expected)
     assert torch.equal(seen.outputs[""], expected.get_state())
+
+
+def test_what_is_drawn_from_torchs_own_generator_is_the_same_each_time_and_leaves_no_trace():
+    torch.manual_seed(7)
+    before = torch.get_rng_state()
+    first, again = (observe(lambda: torch.rand(3), {}, repeat=2) for _ in range(2))
+    assert torch.equal(first.outputs["0"], again.outputs["0"]) and torch.equal(first.outputs["1"], again.outputs["1"])
+    assert not torch.equal(first.outputs["0"], first.outputs["1"])
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_lazy_results_draw_from_torchs_own_generator_too():
+    def batches():
+        for _ in range(2):
+            yield torch.rand(())
+
+    assert observe(batches, {}) == observe(batches, {})
