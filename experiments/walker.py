@@ -41,13 +41,13 @@ CHOICES = {
 }
 
 
-def settings(variant: str) -> sac.SACSettings:
-    """What `SACSettings` knows of a variant."""
+def settings(place: str, choice: dict[str, Any]) -> sac.SACSettings:
+    """The settings of experiments/control.py for a task, with what `SACSettings` knows of a choice."""
     names = ("learning_rate", "initial_alpha", "batch_size")
-    return SAC_SETTINGS[PLACE].but(**{name: CHOICES[variant][name] for name in names})
+    return SAC_SETTINGS[place].but(**{name: choice[name] for name in names})
 
 
-VARIANTS = {variant: configuration("sac", PLACE, settings(variant)) | choice for variant, choice in CHOICES.items()}
+VARIANTS = {variant: configuration("sac", PLACE, settings(PLACE, choice)) | choice for variant, choice in CHOICES.items()}
 SEEDS = 3
 
 
@@ -63,18 +63,20 @@ class Early(sac.Training):
 
 
 class Run(SACRun):
-    """A variant's training, as `followed` advances it."""
+    """A choice's training in one environment, as `followed` advances it."""
 
-    def __init__(self, variant: str, seed: int):
-        self.settings = settings(variant)
+    def __init__(self, place: str, chosen: sac.SACSettings, choice: dict[str, Any], seed: int):
+        self.settings = chosen
         taught = sac.Taught.of(vars(ch47))
-        self.training = Early(gym.make(ENVIRONMENTS[PLACE]), self.settings, seed, taught, ch48.fast_sac_update)
-        self.training.updates_from = CHOICES[variant]["updates_from"]
-        if not CHOICES[variant]["adapts"]:
+        self.training = Early(gym.make(ENVIRONMENTS[place]), chosen, seed, taught, ch48.fast_sac_update)
+        self.training.updates_from = choice["updates_from"]
+        if not choice["adapts"]:
             self.training.agent.temperature_optimizer.learning_rate = 0.0
         self.best_action = self.training.agent.best_action
 
 
 def run(variant: str, seed: int, checkpoint_dir: Path, report: Report) -> Result:
     """Train one agent and evaluate it on the way."""
-    return followed(Run(variant, seed), ENVIRONMENTS[PLACE], VARIANTS[variant]["every"], CHUNK["sac"], checkpoint_dir, report)
+    choice = CHOICES[variant]
+    made = Run(PLACE, settings(PLACE, choice), choice, seed)
+    return followed(made, ENVIRONMENTS[PLACE], VARIANTS[variant]["every"], CHUNK["sac"], checkpoint_dir, report)
