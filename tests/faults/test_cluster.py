@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 
@@ -61,7 +62,8 @@ class Cluster:
         for process in self.started:
             if process.poll() is None:
                 for one in [*psutil.Process(process.pid).children(recursive=True), process]:
-                    one.kill()
+                    with suppress(psutil.NoSuchProcess):  # a child may end between the listing and here
+                        one.kill()
                 process.wait()
 
 
